@@ -92,6 +92,8 @@ def run_headless(
     save_surfaces(rehearsal, out)
     drawn = [pictures.save()] if pictures is not None else []
     report = tally.report(rehearsal, arch) | dict(reading=frames.measurements.figures())
+    if rehearsal.judgement is not None:
+        report |= dict(resection=rehearsal.judgement.report())
     write_json(report, out / "report.json")
     click.echo(summary(report))
     click.echo(f"Wrote {' and '.join([*drawn, 'report.json'])} to {out}")

@@ -12,6 +12,8 @@ import trimesh
 
 from rehearsal.build_solver import build_solver, static_shape, step_settings, tool_of
 from rehearsal.configuration import probe_of
+from rehearsal.resection.cut import Cut
+from rehearsal.resection.score_line import ResectionError
 from rehearsal.stopwatch import timed
 from scenes.anatomy import Grid, LoadedAnatomy, press_on
 from scenes.mechanical_tissues import mechanical_properties
@@ -23,6 +25,8 @@ from sim.body import BodyState
 from sim.device import backend
 from sim.divergence_check import DivergenceCheck, DivergenceState
 from sim.material import Material, Part
+from sim.neo_hookean import NeoHookean
+from sim.removed_tissue import RemovedTissue
 from sim.shapes import Plane, SignedDistanceField
 from sim.solver import SolverState
 from sim.stored_arrays import stored
@@ -78,15 +82,21 @@ class PressedOrgan:
         self.scene = scene
         self.probe = probe or probe_of(scene)
         self.origin = anatomy.organ.bounds.mean(axis=0)
-        self.organ = translated(anatomy.organ, -self.origin)
+        self.whole_organ = translated(anatomy.organ, -self.origin)
         self.gravity_direction = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
         self.press = press_on(scene.press, anatomy, self.gravity_direction)
+        self.cut: Cut | None = None
         self._build_solver(anatomy)
         self._shapes = anatomy.shapes
         self.divergence_check = DivergenceCheck(self.solver)
         self.notice = ""
         self.steps = 0
         self.pose = advanced(self._press_pose(), -AWAY_MM)
+
+    @property
+    def organ(self) -> trimesh.Trimesh:
+        """The organ's surface at rest: after a cut, of what remains."""
+        return self.whole_organ if self.cut is None else self.cut.remnant
 
     def _build_solver(self, anatomy: LoadedAnatomy) -> None:
         self.size_mm = np.array(self.probe.housing_mm)
@@ -96,7 +106,7 @@ class PressedOrgan:
         fixed, tethers = attachments_of(self.scene.attachment, self.origin, np.array(self.press.direction))
         self.parts_of_tissue = parts_of(self.scene, anatomy, self.origin)
         self.solver = build_solver(
-            self.organ,
+            self.whole_organ,
             tissue,
             shapes,
             self.tool,
@@ -159,7 +169,7 @@ class PressedOrgan:
         yield from (sections, repr(self.settings), self.young_kpa, self.press.warm_up_steps)
         yield from (
             self.probe.model_dump_json(),
-            self.organ,
+            self.whole_organ,
             self.origin,
             self.pose,
             repr(self.press.direction),
@@ -239,6 +249,21 @@ class PressedOrgan:
     def store_valid_state(self) -> None:
         """Make the present tissue, if it is valid, the state that the divergence check restores."""
         self.divergence_check.store_if_healthy()
+
+    def apply_cut(self, cut: Cut | None) -> None:
+        """Cut the whole organ, or with None restore it. The tissue's state stays as it is. Raises ResectionError."""
+        if cut is self.cut:
+            return
+        if not isinstance(self.model, NeoHookean):
+            raise ResectionError(
+                f"tissue of the model {self.scene.tissue.model} cannot be cut; choose --model neo-hookean"
+            )
+        parts = [part.surface for part in self.parts_of_tissue]
+        tissue = None if cut is None else RemovedTissue(cut.specimen, cut.remnant, cut.on_remnant)
+        self.model.remove_tissue(self.whole_organ, tissue, parts)
+        lattice = self.model.lattice
+        self.divergence_check.test_among(lattice.node_mass(np.ones(len(lattice.cells))) > 0)
+        self.cut = cut
 
     def digest(self) -> str:
         """A hash of the tissue's state: it changes with every bit."""

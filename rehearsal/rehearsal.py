@@ -12,6 +12,10 @@ import trimesh
 
 from rehearsal.build_solver import embedding_cell_mm
 from rehearsal.pressed_organ import OrganState, PressedOrgan
+from rehearsal.resection.cut import Cut, cut_organ, part_outside
+from rehearsal.resection.judgement import Carried, Judgement, judge
+from rehearsal.resection.resection_state import NO_RESECTION, Resection
+from rehearsal.resection.score_line import LEAST_MARKS, ResectionError, ScoreLine, score_line
 from scenes.anatomy import Grid, LoadedAnatomy
 from scenes.scene import Scene
 from scenes.surfaces import translated, volume_mm3
@@ -19,6 +23,7 @@ from scenes.terminal import ReportProgress, no_progress
 from sim.embedding import Embedding
 from sim.fields import array_of
 from sim.skinning import Skin
+from ultrasound.crater import Crater
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import (
     ImagePlane,
@@ -38,13 +43,16 @@ SUPPORT_SUNK_MM = 0.4
 SURROUNDINGS_MM = 25.0
 # Points along each side of an image whose rest positions are computed.
 REST_PLACES = 48
+# Cuts of this many states are kept, for undo and redo.
+KEPT_CUTS = 4
 
 
 @dataclass(frozen=True)
 class RehearsalState(OrganState):
-    """What changes: the state of the organ and its transducer, and of the transducer's manipulator."""
+    """What changes: the state of the organ and its transducer, of the transducer's manipulator, and of the resection."""
 
     manipulator: ManipulatorState
+    resection: Resection = NO_RESECTION
 
 
 class Rehearsal(PressedOrgan):
@@ -70,10 +78,15 @@ class Rehearsal(PressedOrgan):
             acoustics = start_acoustics(scanned) if needs_b_mode else None
         progress("Building the model: tissue and contacts")
         super().__init__(scene, anatomy, probe)
-        self.tumour = anatomy.tumour and translated(anatomy.tumour, -self.origin)
-        # The sinus surrounds the other parts, and would hide them.
-        drawn = {tissue: part for tissue, part in anatomy.parts.items() if tissue != "sinus"}
-        self.parts = {tissue: translated(part, -self.origin) for tissue, part in drawn.items()}
+        self.resection = NO_RESECTION
+        self.score: ScoreLine | None = None
+        self.score_fault = ""
+        self._score_points: Skin | None = None
+        self._cuts: dict[Resection, Cut] = {}
+        self._judgements: dict[Resection, Judgement] = {}
+        self._labels = anatomy.labels, anatomy.tissues
+        self.whole_tumour = anatomy.tumour and translated(anatomy.tumour, -self.origin)
+        self.whole_parts = {tissue: translated(part, -self.origin) for tissue, part in anatomy.parts.items()}
         meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
         self.supports = [_shrunk(translated(mesh, -self.origin), SUPPORT_SUNK_MM) for mesh in meshes]
         progress("Building the model: surfaces")
@@ -94,6 +107,12 @@ class Rehearsal(PressedOrgan):
         self.settled = self.snapshot()
 
     def _build_surfaces(self) -> None:
+        """The surfaces that move with the tissue: of the whole organ and its parts, or of what remains of them after a cut."""
+        self.tumour = self.whole_tumour and part_outside(self.whole_tumour, self.cut)
+        # The sinus surrounds the other parts, and would hide them.
+        parts = {tissue: part for tissue, part in self.whole_parts.items() if tissue != "sinus"}
+        remains = {tissue: part_outside(part, self.cut) for tissue, part in parts.items()}
+        self.parts = {tissue: part for tissue, part in remains.items() if part is not None}
         self.organ_skin = Skin(self.model, self.organ.vertices)
         self.tumour_skin = self._tumour_border = None
         if self.tumour is not None:
@@ -145,13 +164,93 @@ class Rehearsal(PressedOrgan):
         """A copy of the present state, with the manipulator's present state or another one."""
         organ = self.snapshot_of_organ()
         return RehearsalState(
-            organ.solver, organ.divergence, organ.pose, organ.steps, manipulator or self.manipulator.state
+            organ.solver,
+            organ.divergence,
+            organ.pose,
+            organ.steps,
+            manipulator or self.manipulator.state,
+            self.resection,
         )
 
     def restore(self, state: RehearsalState) -> None:
         """Restore a state; the steps that follow give the same bits as before."""
         self.restore_organ(state)
         self.manipulator.state = state.manipulator
+        self.set_resection(state.resection)
+
+    def set_resection(self, resection: Resection) -> None:
+        """Have these marks of the score and this cut. Raises ResectionError, before anything has changed."""
+        if resection == self.resection:
+            return
+        cut = None if resection.cut is None else self._cut_of(resection)
+        if cut is not self.cut:
+            self.apply_cut(cut)
+        if resection.marks != self.resection.marks:
+            self._set_score(resection.points())
+        self.resection = resection
+
+    def _set_score(self, marks: np.ndarray) -> None:
+        """The line through marks (n, 3), which moves with the tissue; ``score_fault`` says why there is none."""
+        self.score, self.score_fault = None, ""
+        if len(marks) >= LEAST_MARKS:
+            try:
+                self.score = score_line(self.whole_organ, marks)
+            except ResectionError as error:
+                self.score_fault = str(error)
+        shown = marks if self.score is None else np.concatenate([self.score.points, self.score.marks])
+        self._score_points = Skin(self.model, shown) if len(marks) else None
+
+    def score_points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Present places [mm] of the score: points (k, 3) of the closed line, and its marks (n, 3)."""
+        if self._score_points is None:
+            return np.zeros((0, 3)), np.zeros((0, 3))
+        self._score_points.update()
+        points = array_of(self._score_points.vertices).astype(float)
+        on_line = 0 if self.score is None else len(self.score.points)
+        return points[:on_line], points[on_line:]
+
+    def _cut_of(self, resection: Resection) -> Cut:
+        """The cut of a resection. Raises ResectionError."""
+        if resection not in self._cuts and resection.cut is not None:
+            line = score_line(self.whole_organ, resection.points())
+            tumour = np.zeros((0, 3)) if self.whole_tumour is None else np.asarray(self.whole_tumour.vertices)
+            seen = tumour[resection.cut.seen_of(len(tumour))]
+            made = cut_organ(self.whole_organ, line, resection.cut.settings, seen)
+            self._cuts = dict([*self._cuts.items(), (resection, made)][-KEPT_CUTS:])
+        return self._cuts[resection]
+
+    def apply_cut(self, cut: Cut | None) -> None:
+        super().apply_cut(cut)
+        self._build_surfaces()
+        self.embedding.skin.attach_again()
+        if self.scanner is not None:
+            self.scanner.set_crater(None if cut is None else Crater(cut.specimen, cut.settings.filling))
+        if self._score_points is not None:
+            self._score_points.attach_again()
+
+    def carried_then(self, points: np.ndarray) -> np.ndarray:
+        """Where points (n, 3) [mm] of the whole organ at rest were when it was cut. Raises ResectionError without a cut."""
+        request = self.resection.cut
+        if request is None:
+            raise ResectionError("nothing was cut yet")
+        return self.model.whole_lattice.carried(  # type: ignore[attr-defined]
+            np.asarray(points, float), request.nodes_mm
+        )
+
+    @property
+    def judgement(self) -> Judgement | None:
+        """The figures of the cut; None without a cut, or without a tumour to judge by."""
+        cut, tumour, key = self.cut, self.whole_tumour, self.resection
+        if cut is None or tumour is None:
+            return None
+        if key not in self._judgements:
+            surfaces = (self.whole_organ, cut.specimen, cut.remnant, tumour)
+            as_cut = Carried(*(self.carried_then(each.vertices) for each in surfaces))
+            labels, tissues = self._labels
+            moved = labels and Grid(labels.voxels, labels.index_from_mm @ shift_by(self.origin))
+            given = cut, self.whole_organ, tumour, self.whole_parts, as_cut, moved, tissues
+            self._judgements = {key: judge(*given)}
+        return self._judgements[key]
 
     def update_surfaces(self) -> None:
         """Move the drawn surfaces with the body."""
@@ -211,13 +310,18 @@ def _shrunk(mesh: trimesh.Trimesh, by_mm: float) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices - by_mm * mesh.vertex_normals, mesh.faces, process=False)
 
 
+def shift_by(origin: np.ndarray) -> np.ndarray:
+    """The affine map (4, 4) from places relative to an origin (3,) to the patient's."""
+    shift = np.eye(4)
+    shift[:3, 3] = origin
+    return shift
+
+
 def scanned_anatomy(
     organ: trimesh.Trimesh, ct: Grid, anatomy: LoadedAnatomy, origin: np.ndarray
 ) -> ScannedAnatomy:
     """The anatomy as the scanner needs it, relative to an origin; the organ is already moved there."""
-    labels = anatomy.labels
-    shift = np.eye(4)
-    shift[:3, 3] = origin
+    labels, shift = anatomy.labels, shift_by(origin)
     label_values = None if labels is None else labels.voxels.astype(np.int32)
     tumour = anatomy.tumour and translated(anatomy.tumour, -origin)
     return ScannedAnatomy(organ, ct.voxels, ct.index_from_mm @ shift, label_values, anatomy.tissues, tumour)

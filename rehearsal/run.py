@@ -26,6 +26,7 @@ from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.real_time.solver_process import SolverProcess
 from rehearsal.real_time.start_times import StartTimes
 from rehearsal.rehearsal import Rehearsal, RehearsalState
+from rehearsal.resection.script import ResectionScript
 from rehearsal.sessions.open_session import open_session
 from rehearsal.sessions.recorder import SessionRecorder, record
 from rehearsal.sessions.replay import Replay
@@ -143,17 +144,19 @@ class RehearsalRun:
         return self.rehearsal.settings.time_step_s
 
     def _session(self) -> Session:
-        return Session(self.rehearsal, coverage=lambda: self.measurements.coverage.seen)
+        return Session(self.rehearsal, coverage=lambda: self.measurements.coverage)
 
     def _user_input(self, begins: RehearsalState | None = None) -> UserInput:
         session = self._session()
         recorder = self._record(session, begins)
         tracked: PoseSource | None = None
+        script = None
         if self.files.track is not None:
             tracked = partial(played_pose, self.files.track, session)
+            script = ResectionScript(list(self.files.track.actions))
         elif self.link is not None and self.asked.link_leads:
             tracked = self.link.received_pose.pose
-        return UserInput(session, recorder, begins is not None, tracked, self.notices)
+        return UserInput(session, recorder, begins is not None, tracked, script, self.notices)
 
     def _replay_input(self, replay: Replay) -> ReplayInput:
         return ReplayInput(replay, self._take_over, self.notices)

@@ -4,12 +4,15 @@ Lengths are in mm, angles in degrees, patient coordinates LPS. Nothing here need
 """
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from ultrasound.probe import DetailLevel, DopplerMode, Mode
 from ultrasound.target import Target
+
+Technique = Literal["enucleation", "enucleoresection", "wedge"]
+TECHNIQUES: tuple[Technique, ...] = get_args(Technique)
 
 B_MODE, TGC, DOPPLER = "B-mode", "TGC", "Doppler"
 # Groups of settings beside the image, as on a scanner: one of the last two is shown.
@@ -98,7 +101,17 @@ class PlanSettings:
 
 
 @dataclass
-class Settings(PlanSettings, ViewSettings, ScannerSettings, TissueSettings):
+class ResectionSettings:
+    """How the next cut is made; its margin is that of the plan."""
+
+    cut_depth_mm: int = _slider(0, "Depth", "mm", 0, 60, "Resection")
+    """Below the score; 0: as deep as tumour and margin were seen in the image."""
+    air_in_crater: bool = _switch(False, "Air in the crater", "Resection")
+    technique: Technique = "enucleoresection"
+
+
+@dataclass
+class Settings(ResectionSettings, PlanSettings, ViewSettings, ScannerSettings, TissueSettings):
     """What the user sets; each part of the program is handed its own part. A session records them by their names."""
 
 
@@ -235,6 +248,12 @@ class Controls:
     next_plan: bool = False
     pointed_mm: tuple[float, float] | None = None
     """The point of the image plane that was clicked on."""
+    score_image: bool = False
+    """Set marks of the score at both edges of tumour and margin in the image."""
+    score_under: tuple[np.ndarray, np.ndarray] | None = None
+    """Set a mark of the score where this ray meets the organ: origin [mm] and unit direction, each (3,)."""
+    cut_out: bool = False
+    """Cut along the score."""
     cine: int = 0
     """Frames to move forward (negative: back) in the cine memory."""
     export: bool = False

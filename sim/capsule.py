@@ -34,7 +34,8 @@ class Capsule:
         self.body = body
         self.count = len(nodes)
         self.node, self.gradient = field_of(nodes, 1), field_of(gradient, 1)
-        self.area_mm2 = area
+        self.area_mm2, self.share = area, np.ones(self.count)
+        self.stiffness_n_mm = stiffness_n_mm
         self.weight = field_of(N_MM * stiffness_n_mm / 3 * area)
         self.deformation = ti.Matrix.field(3, 2, ti.f32, self.count)
         places = csr_array(
@@ -46,7 +47,13 @@ class Capsule:
 
     def set_stiffness(self, stiffness_n_mm: float) -> None:
         """Change modulus times thickness [N/mm]."""
-        fill((self.weight, N_MM * stiffness_n_mm / 3 * self.area_mm2))
+        self.stiffness_n_mm = stiffness_n_mm
+        fill((self.weight, N_MM * stiffness_n_mm / 3 * self.area_mm2 * self.share))
+
+    def set_share(self, share: np.ndarray) -> None:
+        """Leave a share (p,) of each patch's area."""
+        self.share = share
+        self.set_stiffness(self.stiffness_n_mm)
 
     @ti.func
     def begin(self):

@@ -72,6 +72,11 @@ class Lattice:
         cell, inside = places_in_cells(points, self.cell_mm, self.low_mm, self.index_of)
         return self.cells[cell], shape_functions(inside)
 
+    def carried(self, points: np.ndarray, position: np.ndarray) -> np.ndarray:
+        """Where points (k, 3) [mm] at rest are for positions (n, 3) [mm] of the nodes."""
+        nodes, weights = self.interpolation(points)
+        return points + np.einsum("kn,kna->ka", weights, (position - self.nodes)[nodes])
+
 
 def places_in_cells(
     points: np.ndarray, cell_mm: float, low_mm: np.ndarray, index_of: np.ndarray
@@ -173,7 +178,7 @@ def _filled(
     return indices[has_tissue], filled[has_tissue]
 
 
-def _shares(
+def shares(
     filled: np.ndarray, indices: np.ndarray, low: np.ndarray, cell_mm: float, parts: Sequence[trimesh.Trimesh]
 ) -> np.ndarray:
     """Volume shares (m, parts) of the parts in the tissue of each cell."""
@@ -220,7 +225,7 @@ def _assemble(
     index_of = np.full(size, -1)
     index_of[tuple(indices.T)] = np.arange(len(indices))
     volume = cell_mm**3 * weight.mean(axis=1)
-    mean, variance = _gradients(weight / weight.sum(axis=1, keepdims=True))
+    mean, variance = gradients(weight / weight.sum(axis=1, keepdims=True))
     return Lattice(
         cell_mm=cell_mm,
         low_mm=low,
@@ -231,12 +236,12 @@ def _assemble(
         volume=volume,
         hourglass=volume[:, None, None] / cell_mm**2 * variance,
         tissue=carried,
-        share=_shares(filled, indices, low, cell_mm, parts),
+        share=shares(filled, indices, low, cell_mm, parts),
         index_of=index_of,
     )
 
 
-def _gradients(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def gradients(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean (m, 8, 3) and variance (m, 8, 8), summed over the axes, of B over samples with weights (m, s)."""
     at_samples = shape_gradients(SAMPLE_POINTS)
     mean = np.einsum("ms,sia->mia", weight, at_samples)
@@ -250,9 +255,7 @@ def surface_patches(
     """Patches of a surface, one for each cell and direction that it faces: nodes (p, 8), tangential gradients (p, 8, 2) [1/mm] of
     their shape functions, averaged over the patch, and areas (p,) [mm^2].
     """
-    middle, area, normal = _small_faces(surface, cell_mm / 2)
-    cell, inside = places_in_cells(middle, cell_mm, low_mm, index_of)
-    keys, owner = _unique_rows(np.column_stack([cell, _sides(normal)]))
+    _, area, normal, inside, keys, owner = faces_by_patch(surface, cell_mm, low_mm, index_of)
     total = np.bincount(owner, area)
 
     def mean(values: np.ndarray) -> np.ndarray:
@@ -263,6 +266,18 @@ def surface_patches(
     # Two axes in the plane whose normal is the mean one.
     tangents = np.linalg.svd(mean(normal)[:, None])[2][:, 1:]
     return cells[keys[:, 0]], np.einsum("pka,pta->pkt", gradient, tangents), total
+
+
+def faces_by_patch(
+    surface: trimesh.Trimesh, cell_mm: float, low_mm: np.ndarray, index_of: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Small faces of a surface: middles (f, 3) [mm], areas (f,) [mm^2], normals (f, 3), places (f, 3) in their unit cell; the cell and side
+    (p, 2) of each patch, and the patch (f,) of each face.
+    """
+    middle, area, normal = _small_faces(surface, cell_mm / 2)
+    cell, inside = places_in_cells(middle, cell_mm, low_mm, index_of)
+    keys, owner = _unique_rows(np.column_stack([cell, _sides(normal)]))
+    return middle, area, normal, inside, keys, owner
 
 
 def _small_faces(surface: trimesh.Trimesh, longest_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 import taichi as ti
 import taichi.math as tm
+import trimesh
 
 from sim.attachment import total_stiffness
 from sim.body import Body
@@ -24,6 +25,7 @@ from sim.fields import field_of, fields_of, fill
 from sim.lattice import CORNERS, Lattice, fill_with_cells, surface_points
 from sim.linear_algebra import cross, four, row, solve
 from sim.material import Material, mixture
+from sim.removed_tissue import RemovedTissue, lattice_without, patch_shares, points_without
 from sim.rigid_correction import RigidCorrection
 from sim.solver import StepSettings
 from sim.stored_arrays import stored
@@ -117,7 +119,7 @@ class NeoHookean:
     ) -> None:
         starts = [int(v) for v in lattice.colour_start]
         self.body = body
-        self.lattice = lattice
+        self.lattice = self.whole_lattice = lattice
         self.contacts: Any = contacts
         self.has_contacts = contacts is not None
         self.colours = tuple(pairwise(starts))
@@ -128,6 +130,9 @@ class NeoHookean:
         self.has_tether = tether_n_mm is not None
         if tether_n_mm is not None:
             self.tether = field_of(N_MM * tether_n_mm)
+        self._whole_tether = tether_n_mm
+        self._whole_points = None if contacts is None else (contacts.rest_points, contacts.rest_area_mm2)
+        self.load_g = load_g
         self.capsule: Any = capsule
         self.has_capsule = capsule is not None
         self.count = len(lattice.cells)
@@ -185,6 +190,8 @@ class NeoHookean:
                 weight = self.hourglass_stiffness * stiffness * lattice.hourglass[:, a, b]
                 hourglass[cells[:, a], place_of(a, b)] += weight
         shear = (gradient[:, :, 3] * (gradient[:, :, :3] ** 2).sum(axis=2)).sum(axis=1)
+        # A node whose elements were all removed stays where it is: it has no force, but needs a stiffness.
+        shear[shear == 0.0] = 1.0
         fill((self.gradient, gradient), (self.shear, shear), (self.hourglass, hourglass))
 
     def set_material(
@@ -204,6 +211,34 @@ class NeoHookean:
             mu, lambda_, _ = mixture(self.material, self.parts, self.lattice.share)
             self._fill_stiffness(mu / self.material.mu)
             fill((self.lame_ratio, np.append(lambda_ / mu, 0.0)))
+
+    def remove_tissue(
+        self, organ: trimesh.Trimesh, tissue: RemovedTissue | None, parts: Sequence[trimesh.Trimesh]
+    ) -> None:
+        """Remove tissue from the whole organ at rest, or with None restore all of it. The state stays as it is.
+
+        ``organ`` and ``parts`` are the surfaces that the model was made from [mm].
+        """
+        whole = self.whole_lattice
+        self.lattice = whole if tissue is None else lattice_without(whole, tissue, parts)
+        density = mixture(self.material, self.parts, self.lattice.share)[2]
+        fill((self.mass, self.lattice.node_mass(density) + self.load_g))
+        if self.has_parts:
+            self.set_material(self.material.young_kpa)
+        else:
+            self._fill_stiffness(np.ones(self.count))
+        if self._whole_tether is not None:
+            volume = [each.node_mass(np.ones(self.count)) for each in (self.lattice, whole)]
+            self.set_tether(self._whole_tether * np.minimum(volume[0] / volume[1], 1.0))
+        if self._whole_points is not None:
+            spacing_mm = POINT_SPACING_CELLS * whole.cell_mm
+            points = self._whole_points
+            if tissue is not None:
+                points = points_without(*points, tissue, spacing_mm)
+            self.contacts.set_points(self.lattice, *points)
+        if self.has_capsule:
+            share = np.ones(self.capsule.count) if tissue is None else patch_shares(organ, whole, tissue)
+            self.capsule.set_share(share)
 
     def set_tether(self, tether_n_mm: np.ndarray) -> None:
         """Change the stiffness (n,) of the springs [N/mm]; only where there were any from the start."""

@@ -4,7 +4,7 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from sim.fields import fields_of, run_kernel
+from sim.fields import fields_of, fill, run_kernel
 from sim.tissue_model import TissueModel
 
 
@@ -15,12 +15,17 @@ class Skin:
     """
 
     def __init__(self, model: TissueModel, points: np.ndarray) -> None:
-        points = np.asarray(points, np.float64)
-        frame, weight = model.attach(points)
+        self.points = np.asarray(points, np.float64)
+        frame, weight = model.attach(self.points)
         self.model = model
         self.vertices = ti.Vector.field(3, ti.f32, len(points))
-        self.rest, self.frame, self.weight = fields_of(points, frame, weight, within=1)
+        self.rest, self.frame, self.weight = fields_of(self.points, frame, weight, within=1)
         self.update()
+
+    def attach_again(self) -> None:
+        """Attach the points anew, after tissue was removed from the model or restored."""
+        frame, weight = self.model.attach(self.points)
+        fill((self.frame, frame), (self.weight, weight))
 
     def update(self) -> None:
         """Move the points with the model's current frames."""

@@ -55,18 +55,13 @@ class SurfaceContacts:
         self.coefficient = ti.field(ti.f32, ())
         self.coefficient[None] = friction
         self.count = len(points)
-        nodes, weights = lattice.interpolation(points)
+        self.rest_points, self.rest_area_mm2 = points, area_mm2
         self.point = ti.Vector.field(3, ti.f32, self.count)
         self.start = ti.Vector.field(3, ti.f32, self.count)
         self.near = ti.field(ti.i32, self.count)
+        nodes, weights, *by_node = self._interpolation(lattice, points)
         self.node, self.weight = fields_of(nodes, weights, within=1)
-        offsets = np.arange(0, nodes.size + 1, nodes.shape[1])
-        points_of = csr_array(
-            (weights.ravel(), nodes.ravel(), offsets), shape=(len(nodes), body.count)
-        ).T.tocsr()
-        self.area, self.node_start, self.node_point, self.node_weight = fields_of(
-            area_mm2, points_of.indptr, points_of.indices, points_of.data
-        )
+        self.area, self.node_start, self.node_point, self.node_weight = fields_of(area_mm2, *by_node)
         self.plane = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
         self.found = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
         self.state = dict(point=self.point, near=self.near, plane=self.plane, found=self.found)
@@ -79,6 +74,28 @@ class SurfaceContacts:
         self.blocks = -(-self.count // BLOCK)
         self.block_wrench = ti.Vector.field(6, ti.f32, self.blocks)
         self.reset()
+
+    def _interpolation(self, lattice: Lattice, points: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Nodes and weights (p, 8) of points; and by node: the first entry (n + 1,), the points and their weights (8 p,)."""
+        nodes, weights = lattice.interpolation(points)
+        offsets = np.arange(0, nodes.size + 1, nodes.shape[1])
+        of_nodes = csr_array(
+            (weights.ravel(), nodes.ravel(), offsets), shape=(len(nodes), self.body.count)
+        ).T.tocsr()
+        return nodes, weights, of_nodes.indptr, of_nodes.indices, of_nodes.data
+
+    def set_points(self, lattice: Lattice, points: np.ndarray, area_mm2: np.ndarray) -> None:
+        """Put the contact points at other places (p, 3) [mm] at rest, with other areas (p,) [mm^2]; those of another place lose their friction."""
+        before = array_of(self.node), array_of(self.weight)
+        self.rest_points, self.rest_area_mm2 = points, area_mm2
+        fields = self.node, self.weight, self.node_start, self.node_point, self.node_weight
+        fill((self.area, area_mm2), *zip(fields, self._interpolation(lattice, points), strict=True))
+        if self.friction > 0:
+            now = array_of(self.node), array_of(self.weight)
+            moved = np.any([(a != b).any(axis=1) for a, b in zip(before, now, strict=True)], axis=0)
+            slip = array_of(self.slip)
+            slip[:, moved] = 0.0
+            fill((self.slip, slip))
 
     def reset(self) -> None:
         """Clear stored distances and friction; call it after other code has moved the body."""

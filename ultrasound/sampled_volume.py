@@ -5,7 +5,7 @@ import taichi as ti
 import taichi.math as tm
 import trimesh
 
-from sim.fields import field_of
+from sim.fields import array_of, field_of, fill
 from sim.signed_distance import distance_grid
 
 AIR_HU = -1000.0
@@ -28,12 +28,32 @@ class SampledVolume:
         thin = [(0, 1 if n == 1 else 0) for n in voxels.shape[:3]]
         filled = np.pad(np.asarray(voxels, np.float32), thin + [(0, 0)] * (voxels.ndim - 3), mode="edge")
         self.shape, self.count = voxels.shape[:3], filled.shape[:3]
+        self.index_from_mm = index_from_mm
         self.outside = float(outside)
         self.strides = self.count[1] * self.count[2], self.count[2]
         flat = filled.reshape(-1, *voxels.shape[3:])
         self.voxels = field_of(flat, voxels.ndim - 3)
         self.linear = ti.Matrix(index_from_mm[:3, :3].tolist())
         self.offset = ti.Vector(index_from_mm[:3, 3].tolist())
+
+    @property
+    def voxel_mm(self) -> float:
+        """Mean distance of neighbouring voxels."""
+        return float(np.linalg.norm(np.linalg.inv(self.index_from_mm[:3, :3]), axis=0).mean())
+
+    def values(self, box: tuple[slice, slice, slice]) -> np.ndarray:
+        """A copy of the voxels in a box."""
+        return self._grid()[box]
+
+    def set_values(self, box: tuple[slice, slice, slice], values: np.ndarray) -> None:
+        """Replace the voxels in a box."""
+        grid = self._grid()
+        grid[box] = values
+        fill((self.voxels, grid.reshape(-1, *grid.shape[3:])))
+
+    def _grid(self) -> np.ndarray:
+        values = array_of(self.voxels)
+        return values.reshape(*self.count, *values.shape[1:])
 
     @ti.func
     def cell_at(self, p):

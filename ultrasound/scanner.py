@@ -18,6 +18,7 @@ from sim.embedding import Embedding, Unmoved
 from ultrasound.acoustics import check_tissues, stored_properties
 from ultrasound.blood_flow import stored_flow
 from ultrasound.bmode import BMode, Wavefront
+from ultrasound.crater import Box, Crater
 from ultrasound.doppler import Doppler
 from ultrasound.ground_truth_labels import GroundTruthLabels
 from ultrasound.iq_signal import IQSignal, iq_signal
@@ -94,6 +95,9 @@ class Scanner:
         self.show_background = outside == "background"
         self.contact, self.contact_gap_mm = contact, contact_gap_mm
         self._acoustics = acoustics
+        self.crater: Crater | None = None
+        # Volumes with the crater, and what the voxels that it changed were before.
+        self._changed: list[tuple[SampledVolume, Box, np.ndarray]] = []
         self._dopplers: dict[bool, Doppler] = {}
         self._steered: dict[float, BMode] = {}
         # The last B-mode image, for persistence.
@@ -103,12 +107,12 @@ class Scanner:
     @cached_property
     def ct(self) -> SampledVolume:
         """HU at rest."""
-        return SampledVolume(self.anatomy.hu, self.anatomy.index_from_mm)
+        return self._with_crater("ct", SampledVolume(self.anatomy.hu, self.anatomy.index_from_mm))
 
     @cached_property
     def organ(self) -> SampledVolume:
-        """Signed distance from the organ's surface at rest [mm], negative inside."""
-        return distance_volume(self.anatomy.organ)
+        """Signed distance from the organ's surface at rest [mm], negative inside; a crater with fluid counts as inside."""
+        return self._with_crater("organ", distance_volume(self.anatomy.organ))
 
     @cached_property
     def bmode(self) -> BMode:
@@ -119,7 +123,7 @@ class Scanner:
     def tissue(self) -> SampledVolume:
         """Acoustic properties at rest."""
         values, self._acoustics = (self._acoustics or start_acoustics(self.anatomy)).result(), None
-        return SampledVolume(values, self.anatomy.index_from_mm, outside=0.0)
+        return self._with_crater("tissue", SampledVolume(values, self.anatomy.index_from_mm, outside=0.0))
 
     @cached_property
     def flow(self) -> SampledVolume:
@@ -131,7 +135,33 @@ class Scanner:
         values[..., :3] = values[..., :3] @ axes.T.astype(np.float32)
         from_mm = anatomy.index_from_mm.copy()
         from_mm[:3, 3] -= low
-        return SampledVolume(values, from_mm, outside=0.0)
+        return self._with_crater("flow", SampledVolume(values, from_mm, outside=0.0))
+
+    def set_crater(self, crater: Crater | None) -> None:
+        """Replace the tissue in a crater by what fills it, or with None restore all tissue."""
+        for volume, box, values in self._changed:
+            volume.set_values(box, values)
+        self._changed.clear()
+        self.crater, self._last = crater, None
+        # Built anew when somebody asks for it.
+        self.__dict__.pop("ground_truth", None)
+        for name in ("ct", "organ", "tissue", "flow"):
+            if name in self.__dict__:
+                self._with_crater(name, self.__dict__[name])
+
+    def _with_crater(self, name: str, volume: SampledVolume) -> SampledVolume:
+        """A volume of this scanner, with the crater in it if there is one."""
+        crater = self.crater
+        if crater is None or (name == "organ" and crater.filling == "fluid"):
+            return volume
+        if name == "organ":
+            box, values = crater.without(volume)
+        else:
+            content = {"ct": crater.hu, "tissue": crater.acoustics, "flow": lambda: np.zeros(1, np.float32)}
+            box, values = crater.replaced(volume, content[name]())
+        self._changed.append((volume, box, volume.values(box)))
+        volume.set_values(box, values)
+        return volume
 
     def _propagation(self) -> Propagation:
         voxel_mm = float(self.anatomy.voxel_mm.mean())
@@ -167,8 +197,16 @@ class Scanner:
         """The ground-truth labels of the plane."""
         tumour = self.anatomy.tumour
         return GroundTruthLabels(
-            self.plane, self.organ, None if tumour is None else distance_volume(tumour, 1.0)
+            self.plane,
+            self._without_crater(distance_volume(self.anatomy.organ)),
+            None if tumour is None else self._without_crater(distance_volume(tumour, 1.0)),
         )
+
+    def _without_crater(self, distance: SampledVolume) -> SampledVolume:
+        """Signed distances from what remains, where there is a crater."""
+        if self.crater is not None:
+            distance.set_values(*self.crater.without(distance))
+        return distance
 
     def locate(self, plane: ImagePlane, shape: tuple[int, int] | None = None) -> None:
         """Find the tissue on a plane, without an image; ``shape`` (rows, columns) is that of the next images."""

@@ -14,7 +14,7 @@ from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import ROUNDING_S, Replay
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import SessionError
-from render.viewer import Controls, Settings
+from render.viewer import TECHNIQUES, Controls, Settings
 from ultrasound.probe import DETAIL_LEVELS, DOPPLER_MODES, MODES
 from ultrasound.target import TARGETS
 
@@ -23,6 +23,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "detail_level": DETAIL_LEVELS,
     "doppler": DOPPLER_MODES,
     "plan_for": TARGETS,
+    "technique": TECHNIQUES,
 }
 # What sessions of version 1.0 call a setting -> its name now.
 RENAMED = {"rung": "detail_level"}

@@ -1,19 +1,25 @@
 """The user's input: mouse, keys and gamepad, or a tracked probe, move the transducer; undo, redo, reset and bookmarks."""
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
+from errors import UserError
 from rehearsal.notices import Notices
 from rehearsal.pressed_organ import Step
 from rehearsal.real_time.solver_process import SolverProcess
+from rehearsal.resection.cut import CutSettings
+from rehearsal.resection.operation import cut, mark_under, marks_of_image, places_at_rest, set_marks
+from rehearsal.resection.script import ResectionScript, ScriptedAction
 from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import set_solver
 from rehearsal.sessions.session import History, Session
 from rehearsal.tracking.tracked_probe import PoseSource, TrackEnded, TrackingInput
-from render.viewer import Controls, TissueSettings
+from render.viewer import Controls, Settings, TissueSettings
+from ultrasound.crater import Filling
 
 # A transducer that moves by no more than this in a step is at rest [mm].
 STILL_MM = 1e-3
@@ -31,6 +37,7 @@ class UserInput:
     recorder: SessionRecorder | None = None
     waits: bool = False
     tracked: PoseSource | None = None
+    script: ResectionScript | None = None
     notices: Notices = field(default_factory=Notices)
     _ray: Ray | None = field(default=None, init=False)
     _ray_at_slide: Ray | None = field(default=None, init=False)
@@ -78,6 +85,9 @@ class UserInput:
     def _interrupts(self, controls: Controls) -> bool:
         """Whether the controls change more than the pose, or the whole state is to be recorded."""
         restores = (controls.reset, controls.undo, controls.redo, controls.bookmark, controls.to_bookmark)
+        operates = controls.score_image or controls.score_under is not None or controls.cut_out
+        if operates or (self.script is not None and self.script.is_due(self.session.time_s)):
+            return True
         changes = solver_values(controls.settings) != self._solver_values
         return any(restores) or changes or (self.recorder is not None and self.recorder.is_state_due)
 
@@ -92,6 +102,7 @@ class UserInput:
             self._wait(controls.ray)
             self._goal = rehearsal.pose
             return None
+        self._operate(controls)
         if controls.take_over:
             self._take_over()
             follower = None
@@ -125,6 +136,50 @@ class UserInput:
         """Let the session's file keep up while the solver is ahead: without a whole state."""
         if self.recorder is not None:
             self.recorder.keep_up(may_record_state=False)
+
+    def _operate(self, controls: Controls) -> None:
+        """Set marks of the score, or cut, as the user or the script asks for it; say what cannot be done."""
+        settings = controls.settings
+        if controls.score_under is not None:
+            ray = controls.score_under
+            self._act(lambda: set_marks(self.session, mark_under(self.session.rehearsal, *ray)))
+        if controls.score_image:
+            self._act(
+                lambda: set_marks(
+                    self.session, marks_of_image(self.session.rehearsal, float(settings.margin_mm))
+                )
+            )
+        if controls.cut_out:
+            self._act(lambda: self._cut(cut_settings(settings)))
+        while self.script is not None and self.script.is_due(self.session.time_s):
+            action = self.script.take()
+            self._act(lambda: self._follow_script(action))
+
+    def _follow_script(self, action: ScriptedAction) -> None:
+        if action.score == "image":
+            set_marks(self.session, marks_of_image(self.session.rehearsal, action.margin_mm))
+        elif action.score is not None:
+            set_marks(self.session, places_at_rest(self.session.rehearsal, np.array(action.score, float)))
+        if action.cut is not None:
+            self._cut(action.cut)
+
+    def _cut(self, settings: CutSettings) -> None:
+        coverage = self.session.coverage
+        cut(self.session, settings, None if coverage is None else coverage().is_seen)
+        made = self.session.rehearsal.cut
+        for warning in made.warnings if made is not None else ():
+            self._show(warning)
+
+    def _act(self, action: Callable[[], None]) -> None:
+        """Do something that undo reverts; say why it cannot be done."""
+        before = self.session.rehearsal.resection
+        step = self.session.keep_state()
+        try:
+            action()
+        except UserError as error:
+            self.notices.post(str(error))
+        if self.session.rehearsal.resection != before:
+            self.history.begin_at(step)
 
     def _take_over(self) -> None:
         """Mouse, keys and gamepad replace the tracked probe."""
@@ -220,6 +275,13 @@ def solver_values(settings: TissueSettings) -> dict[str, Any]:
         gravity_m_s2=settings.gravity_m_s2,
     )
     return {name: value for name, value in values.items() if value is not None}
+
+
+def cut_settings(settings: Settings) -> CutSettings:
+    """How the sliders say that the next cut is made."""
+    depth_mm = float(settings.cut_depth_mm) or None
+    filling: Filling = "air" if settings.air_in_crater else "fluid"
+    return CutSettings(settings.technique, float(settings.margin_mm), depth_mm, filling)
 
 
 def acts(controls: Controls, ray: Ray | None) -> bool:

@@ -101,7 +101,7 @@ class LiveMeasurements:
         return self._coverage
 
     def _new_coverage(self) -> Coverage:
-        return Coverage(self.rehearsal.organ, self.rehearsal.tumour, self.margin_mm)
+        return Coverage(self.rehearsal.whole_organ, self.rehearsal.whole_tumour, self.margin_mm)
 
     def watch(self, session: Session, probe: Probe, is_rollback: bool = False) -> None:
         """Update the coverage, measure and record when due, after an image: of a step, or of a rollback."""

@@ -65,7 +65,7 @@ class Trial:
     def __init__(self, problem: PlanningProblem) -> None:
         self.rehearsal = Rehearsal(problem.scene, problem.anatomy, problem.probe)
         self.target = problem.target
-        self.coverage = Coverage(self.rehearsal.organ, self.rehearsal.tumour, problem.margin_mm)
+        self.coverage = Coverage(self.rehearsal.whole_organ, self.rehearsal.whole_tumour, problem.margin_mm)
         self.places = self.coverage.voxel_centres(self.target)
         if len(self.places) == 0:
             raise PlanError(

@@ -14,6 +14,7 @@ from rehearsal.pressed_organ import OrganState, PressedOrgan, Step
 from rehearsal.real_time.pace import MOST_WAIT_S, Pace
 from rehearsal.real_time.pose_path import PosePath
 from rehearsal.real_time.shared_state import SharedState
+from rehearsal.resection.cut import Cut
 from rehearsal.worker_processes import end_with_parent
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
@@ -79,6 +80,10 @@ class SolverLoop:
         self.organ.settings = replace(settings)
         if young_kpa is not None and young_kpa != self.organ.young_kpa:
             self.organ.set_young(young_kpa)
+
+    def apply_cut(self, cut: Cut | None) -> None:
+        """Cut the organ, or with None restore it."""
+        self.organ.apply_cut(cut)
 
     def run(self) -> None:
         """Keep pace with the clock, the transducer at rest."""

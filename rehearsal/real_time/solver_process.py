@@ -19,6 +19,7 @@ from rehearsal.real_time.shared_state import SharedState
 from rehearsal.real_time.solver_loop import PAUSED
 from rehearsal.real_time.started_process import END_S, StartedProcess
 from rehearsal.rehearsal import Rehearsal
+from rehearsal.resection.cut import Cut
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
 from ultrasound.probe import Probe
@@ -49,6 +50,8 @@ class SolverProcess:
         # The times of the input before the newest and of the newest, and the last step that was received.
         self._inputs_s = 0.0, 0.0
         self._last_step: Step | None = None
+        # The cut that the process has.
+        self._cut: Cut | None = None
 
     def build(self, scene: Scene, anatomy: LoadedAnatomy, probe: Probe, arch: str, pace: Pace) -> None:
         """Build the solver of a scene on a backend; ``pace`` chooses its steps by the clock."""
@@ -88,6 +91,9 @@ class SolverProcess:
     def hand_over(self) -> None:
         """Give the rehearsal's state and settings to the paused solver."""
         rehearsal = self.rehearsal
+        if rehearsal.cut is not self._cut:
+            self._cut = rehearsal.cut
+            self._send("apply_cut", self._cut)
         self._send("take_over", rehearsal.snapshot_of_organ(), rehearsal.settings, rehearsal.young_kpa)
 
     def run(self) -> None:

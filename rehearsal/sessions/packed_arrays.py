@@ -2,18 +2,21 @@
 
 import base64
 import io
+import json
 import math
 import struct
 import zipfile
 import zlib
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, ConfigDict, Field, with_config
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, with_config
 from typing_extensions import TypedDict
 
 from rehearsal.rehearsal import RehearsalState
+from rehearsal.resection.cut import CutSettings
+from rehearsal.resection.resection_state import MOST_MARKS, CutRequest, Resection
 from sim.body import BodyState
 from sim.divergence_check import DivergenceState
 from sim.solver import SolverState
@@ -153,6 +156,7 @@ def pack_state(state: RehearsalState) -> str:
         "pose": state.pose,
         **{f"grip.{name}": value for name, value in asdict(state.manipulator).items() if value is not None},
         "numbers": [state.steps, watch.steps_since_good, watch.steps_tangled, watch.is_restored],
+        **_of_resection(state.resection),
     }
     packed = io.BytesIO()
     np.savez_compressed(packed, allow_pickle=False, **arrays)
@@ -175,10 +179,42 @@ def unpack_state(text: str, like: RehearsalState) -> RehearsalState:
         aim = _pose(arrays, "grip.aim") if "grip.aim" in arrays else None
         grip = ManipulatorState(depth, pressed, turn, aim)  # type: ignore[arg-type]
         pose = _pose(arrays, "pose")
+        resection = _resection(arrays, like.solver.body.position.shape)
     except UNREADABLE as error:
         what = str(error) or type(error).__name__
         raise StateError(f"a state that cannot be used ({what.splitlines()[0]})") from None
-    return RehearsalState(now, watch, pose, steps, grip)
+    return RehearsalState(now, watch, pose, steps, grip, resection)
+
+
+def _of_resection(resection: Resection) -> dict[str, Any]:
+    """The arrays of a resection: none before its first mark."""
+    if not resection.marks:
+        return {}
+    marks = {"resection.marks": resection.points()}
+    cut = resection.cut
+    if cut is None:
+        return marks
+    return marks | {
+        "resection.settings": json.dumps(asdict(cut.settings)),
+        "resection.seen": np.frombuffer(cut.seen, np.uint8),
+        "resection.nodes": cut.nodes_mm.astype(np.float32),
+    }
+
+
+def _resection(arrays: dict[str, np.ndarray], nodes: tuple[int, ...]) -> Resection:
+    if "resection.marks" not in arrays:
+        return Resection()
+    places = arrays["resection.marks"].reshape(-1, 3)
+    if len(places) > MOST_MARKS or not np.isfinite(places).all():
+        raise StateError("marks that are no places")
+    marks = Resection().with_marks(places)
+    if "resection.settings" not in arrays:
+        return marks
+    settings = TypeAdapter(CutSettings).validate_python(json.loads(str(arrays["resection.settings"])))
+    position = arrays["resection.nodes"]
+    if position.shape != nodes or position.dtype != np.float32 or not np.isfinite(position).all():
+        raise StateError("a cut of another body")
+    return replace(marks, cut=CutRequest(settings, arrays["resection.seen"].tobytes(), position.tobytes()))
 
 
 def _pose(arrays: dict[str, np.ndarray], name: str) -> np.ndarray:

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 
 from rehearsal.rehearsal import Rehearsal, RehearsalState
+from rehearsal.resection.operation import repeat_cut, repeat_marks
+from rehearsal.resection.score_line import ResectionError
 from rehearsal.sessions.packed_arrays import StateError, unpack_state
 from rehearsal.sessions.session import SETTLED, Session
 from rehearsal.sessions.session_file import Log, SessionError
@@ -13,7 +15,7 @@ from rehearsal.sessions.session_file import Log, SessionError
 # Times are sums of steps.
 ROUNDING_S = 1e-9
 # Events that change the tissue, or the solver's settings.
-CHANGING = ("solver", "back", "state")
+CHANGING = ("solver", "back", "state", "marks", "cut")
 
 
 class Replay:
@@ -85,8 +87,7 @@ class Replay:
             raise SessionError("the session is over")
         back, settings = self._set(index)
         self.rehearsal.settings.time_step_s = float(self.log.lengths_s[index])
-        if any(to == index for _, to in self._backs):
-            self.session.keep_state()
+        self._keep_if_needed(index)
         if back is not None:
             if back not in self.session.kept_states:
                 self.session.kept_states[back] = self._state(self.log.states[back])
@@ -126,6 +127,9 @@ class Replay:
         back: int | None = None
         settings: dict[str, Any] = {}
         for event in self.log.events.get(index, []):
+            if event.kind in ("marks", "cut"):
+                # Undo restores the state before them.
+                self._keep_if_needed(index)
             if event.kind == "solver":
                 set_solver(self.rehearsal, event.value)
             elif event.kind == "settings":
@@ -136,7 +140,24 @@ class Replay:
                 self.rehearsal.store_valid_state()
             elif event.kind == "bookmark":
                 self.bookmarks += 1
+            elif event.kind in ("marks", "cut"):
+                self._operate(event.kind, event.value)
         return back, settings
+
+    def _keep_if_needed(self, index: int) -> None:
+        """Keep the present state if a later rollback restores it."""
+        if self.session.step_index == index and any(to == index for _, to in self._backs):
+            self.session.keep_state()
+
+    def _operate(self, kind: str, value: Any) -> None:
+        """Set the recorded marks, or cut. Raises SessionError."""
+        try:
+            if kind == "marks":
+                repeat_marks(self.rehearsal, value)
+            else:
+                repeat_cut(self.rehearsal, value)
+        except (ResectionError, ValueError) as error:
+            raise SessionError(f"the session's {kind} cannot be repeated: {error}") from None
 
     def settings_until_now(self) -> dict[str, Any]:
         """The settings of the images at the present step."""

@@ -9,6 +9,7 @@ import numpy as np
 from rehearsal.rehearsal import Rehearsal, RehearsalState
 from rehearsal.sessions.packed_arrays import SeenVoxels, pack_seen, pack_state
 from rehearsal.sessions.session_file import Kind
+from ultrasound.coverage import Coverage
 from ultrasound.probe_manipulator import ManipulatorState
 
 # The index before the first step: tissue settled, transducer just touching.
@@ -32,19 +33,18 @@ class Session:
     """``step_index`` counts the steps and the rollbacks since the session began, so that no two states share an index.
 
     ``time_s`` is the simulated time since then: the sum of the steps' lengths, where a rollback counts as a step of the scene's length.
-    ``recorder``, if any, gets everything that a replay needs. ``coverage`` returns which voxels (nx, ny, nz) of the organ have been
-    imaged so far. ``rolled_back_to`` is the index that the last rollback restored, None after a step; ``rollbacks`` counts them.
+    ``recorder``, if any, gets everything that a replay needs. ``coverage`` returns what of the organ has been imaged so far. ``rolled_back_to`` is the index that the last rollback restored, None after a step; ``rollbacks`` counts them.
     """
 
     def __init__(
         self,
         rehearsal: Rehearsal,
         recorder: Recorder | None = None,
-        coverage: Callable[[], np.ndarray] | None = None,
+        coverage: Callable[[], Coverage] | None = None,
     ) -> None:
         self.rehearsal = rehearsal
         self.recorder = recorder
-        self._coverage = coverage
+        self.coverage = coverage
         self.step_index = 0
         self.time_s = 0.0
         self.rolled_back_to: int | None = None
@@ -105,7 +105,7 @@ class Session:
 
     def packed_coverage(self) -> SeenVoxels | None:
         """The voxels imaged so far; None if nobody measures them."""
-        return None if self._coverage is None else pack_seen(self._coverage())
+        return None if self.coverage is None else pack_seen(self.coverage().seen)
 
     def discard_states_but(self, needed: set[int]) -> None:
         """Discard the kept states that are no longer needed."""
@@ -142,13 +142,18 @@ class History:
         if not is_acting:
             return
         if begins or now - self._acted_s > PAUSE_S or now - self._began_s > LONGEST_S:
-            self._begin(manipulator)
+            self.begin(manipulator)
         self._acted_s = now
 
-    def _begin(self, manipulator: ManipulatorState | None = None) -> None:
+    def begin(self, manipulator: ManipulatorState | None = None) -> None:
+        """Begin an action, so that undo restores the present state."""
         self._began_s = self.session.time_s
         self._at = 0
-        self._before.append(self.session.keep_state(manipulator))
+        self.begin_at(self.session.keep_state(manipulator))
+
+    def begin_at(self, step_index: int) -> None:
+        """Begin an action whose state before it was kept under an index."""
+        self._before.append(step_index)
         self.undone.clear()
         self._discard()
 
@@ -170,7 +175,7 @@ class History:
 
     def reset(self) -> None:
         """Restore the settled tissue: an action that can be undone."""
-        self._begin()
+        self.begin()
         self._restore(SETTLED)
 
     def set_bookmark(self) -> int:
@@ -187,7 +192,7 @@ class History:
         if not self.bookmarks:
             return 0
         at = (self._at - 1) % len(self.bookmarks)
-        self._begin()
+        self.begin()
         self._at = at
         self._restore(self.bookmarks[at])
         return at + 1

@@ -14,8 +14,11 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 from typing_extensions import TypedDict
 
 from errors import UserError
+from rehearsal.resection.resection_state import MOST_MARKS
 from rehearsal.sessions.packed_arrays import Seen, SeenVoxels, unpack_lengths, unpack_poses
+from render.viewer import Technique
 from scenes.scene import Scene
+from ultrasound.crater import Filling
 
 FORMAT = 1
 MOST_FILE_BYTES = 2_000_000_000
@@ -59,17 +62,31 @@ class SolverValues(TypedDict, total=False):
     gravity_m_s2: Annotated[float, Field(ge=0, le=100)]
 
 
+class CutValues(TypedDict):
+    """A cut along the score: see ``CutSettings``; ``seen`` has a bit for each vertex of the tumour's surface, as base64."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)  # type: ignore[misc]
+    technique: Technique
+    margin_mm: Annotated[float, Field(ge=0, le=100)]
+    depth_mm: Annotated[float, Field(gt=0, le=500)] | None
+    filling: Filling
+    seen: Annotated[str, Field(pattern=r"^[A-Za-z0-9+/]*={0,2}$", max_length=1_000_000)]
+
+
+Place = Annotated[list[Annotated[float, Field(ge=-1e4, le=1e4)]], Field(min_length=3, max_length=3)]
 # What the value of each kind of event is.
 VALUES: dict[str, TypeAdapter] = {
     "settings": TypeAdapter(dict[str, bool | int | float | str | None]),
     "solver": TypeAdapter(SolverValues),
     "back": TypeAdapter(int),
     "bookmark": TypeAdapter(int),
+    "marks": TypeAdapter(Annotated[list[Place], Field(max_length=MOST_MARKS)]),
+    "cut": TypeAdapter(CutValues),
     "reading": TypeAdapter(dict[str, float | None]),
     "state": TypeAdapter(str),
     "seen": TypeAdapter(Seen),
 }
-Kind = Literal["settings", "solver", "back", "bookmark", "reading", "state", "seen"]
+Kind = Literal["settings", "solver", "back", "bookmark", "marks", "cut", "reading", "state", "seen"]
 
 
 class Event(_Line):

@@ -3,12 +3,13 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from errors import UserError
+from rehearsal.resection.script import CutValues, Number, ScriptedAction
 from ultrasound.probe_manipulator import interpolated
 
 # Tolerance of orthonormal axes: more than the rounding of six digits in a file or of a float32, less than a scaled matrix.
@@ -49,6 +50,7 @@ def _rigid(rows: list[list[float]]) -> list[list[float]]:
 
 
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
+Place = tuple[Number, Number, Number]
 Pose = Annotated[list[Row], Field(min_length=4, max_length=4), AfterValidator(_rigid)]
 
 
@@ -58,14 +60,30 @@ class _FilePose(BaseModel):
     name: str = Field("", max_length=40, pattern=r"^[A-Za-z0-9_-]*$")
     time_s: float | None = None
     probe_to_patient: Pose
+    score: Literal["image"] | list[Place] | None = None
+    """Set marks of the score: at the edges of tumour and margin in the image, or at these places (LPS, mm)."""
+    margin_mm: float = Field(5.0, ge=0, le=20)
+    cut: CutValues | None = None
+    """Cut along the score."""
+
+    def action(self, from_s: float) -> ScriptedAction | None:
+        """What is done at this pose, at its time after another [s]."""
+        if self.time_s is None or (self.score is None and self.cut is None):
+            return None
+        cut = None if self.cut is None else self.cut.settings()
+        return ScriptedAction(self.time_s - from_s, self.score, self.margin_mm, cut)
 
 
 @dataclass(frozen=True)
 class TimedPoses:
-    """Poses (4, 4) of a probe, None where it was not tracked, at times (n,) [s]. Raises PoseError unless the times increase."""
+    """Poses (4, 4) of a probe, None where it was not tracked, at times (n,) [s]. Raises PoseError unless the times increase.
+
+    ``actions`` are those of a resection, at times after the first pose.
+    """
 
     times_s: np.ndarray
     poses: list[np.ndarray | None]
+    actions: tuple[ScriptedAction, ...] = ()
 
     def __post_init__(self) -> None:
         back = np.flatnonzero(np.diff(self.times_s) <= 0)
@@ -120,9 +138,13 @@ def load_timed_poses(path: Path) -> TimedPoses:
             raise PoseError(
                 f"{path}: pose {number} has no time; expected time_s in JSON, or in CSV seconds and sixteen numbers per line"
             )
+    times_s = np.array([each.time_s for each in placed])
+    actions = [each.action(times_s[0]) for each in placed]
     try:
         return TimedPoses(
-            np.array([each.time_s for each in placed]), [np.array(each.probe_to_patient) for each in placed]
+            times_s,
+            [np.array(each.probe_to_patient) for each in placed],
+            tuple(action for action in actions if action is not None),
         )
     except PoseError as error:
         raise PoseError(f"{path}: {error}") from None

@@ -12,6 +12,8 @@ import pytest
 from test_undo_history import STEP_S, Numbers
 
 from rehearsal.measurements.session_summary import SessionCourse, summary_text
+from rehearsal.resection.cut import CutSettings
+from rehearsal.resection.resection_state import CutRequest, Resection
 from rehearsal.sessions import packed_arrays
 from rehearsal.sessions.packed_arrays import StateError, pack_state, unpack_state
 from ultrasound.coverage import Gap
@@ -27,6 +29,11 @@ def arrays_of(state: Any) -> list[np.ndarray]:
     return [np.asarray(state)]
 
 
+def before_cut(numbers: Numbers) -> np.ndarray:
+    """Positions of the nodes when they were cut."""
+    return np.arange(numbers.position.size, dtype=np.float32).reshape(-1, 3) / 3
+
+
 @pytest.mark.parametrize("aim", [None, np.diag([-0.0, 1 / 3, 5e-324, 1.0])])
 def test_a_state_as_text_keeps_every_bit(aim):
     numbers = Numbers()
@@ -35,12 +42,14 @@ def test_a_state_as_text_keeps_every_bit(aim):
     numbers.watch = replace(numbers.watch, steps_tangled=3, is_restored=True)
     numbers.velocity = np.array([[-0.0, 1e-45, np.inf], [np.nan, 1 / 3, -7]], np.float32)
     numbers.manipulator.state = ManipulatorState(0.1, 2.3, (1 / 3, -4.0, 5.0), aim)
-    before = numbers.snapshot()
+    cut = CutRequest(CutSettings("wedge", 1 / 3, None, "air"), b"\x05", before_cut(numbers).tobytes())
+    before = replace(numbers.snapshot(), resection=Resection(((1 / 3, -0.0, 5e-324), (1.0, 2.0, 3.0)), cut))
     pairs = list(
         zip(arrays_of(before), arrays_of(unpack_state(pack_state(before), numbers.settled)), strict=True)
     )
-    # Now and when last good: position, velocity and contacts; the watch's three; pose, steps; the hand's four.
-    assert len(pairs) == 2 * 3 + 3 + 2 + 4
+    # Now and when last good: position, velocity and contacts; the watch's three; pose, steps; the hand's four; marks, and of the cut its
+    # four settings, what was seen, and the nodes.
+    assert len(pairs) == 2 * 3 + 3 + 2 + 4 + 1 + 4 + 2
     assert all(old.dtype == new.dtype and old.tobytes() == new.tobytes() for old, new in pairs)
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ import app
 from rehearsal.configuration import probe_of
 from rehearsal.inputs.input_source import ReplayInput
 from rehearsal.inputs.user_input import UserInput
+from rehearsal.resection.cut import CutSettings
+from rehearsal.resection.script import ResectionScript, ScriptedAction
 from rehearsal.sessions import recorder
 from rehearsal.sessions.packed_arrays import pack_poses, pack_seen, unpack_poses, unpack_seen
 from rehearsal.sessions.recorder import SessionRecorder, record
@@ -44,8 +47,15 @@ def header() -> Header:
 
 
 def live_into(path: Path, seen: Callable[[], np.ndarray] | None = None) -> UserInput:
-    session = Session(Numbers(), coverage=seen)
+    session = Session(Numbers(), coverage=None if seen is None else lambda: SimpleNamespace(seen=seen()))
     return UserInput(session, SessionRecorder(session, path, header()))
+
+
+def scripted(random: np.random.Generator) -> list[ScriptedAction]:
+    """Sometimes a mark, or a cut; both are refused after a cut, and a cut without a mark."""
+    marks = [(0.0, 0.0, float(random.uniform(5.0, 15.0)))] if random.random() < 0.1 else None
+    cut = CutSettings("wedge", float(random.integers(0, 9))) if random.random() < 0.03 else None
+    return [] if marks is None and cut is None else [ScriptedAction(0.0, marks, 5.0, cut)]
 
 
 def lead(live: UserInput, moments: int, seed: int, lengths_s: tuple[float, ...] = (STEP_S,)) -> str:
@@ -61,6 +71,7 @@ def lead(live: UserInput, moments: int, seed: int, lengths_s: tuple[float, ...] 
         keys = ("undo", "redo", "reset", "bookmark", "to_bookmark")
         did = {key: bool(random.random() < 0.04) for key in keys}
         x_mm = float(random.uniform(-8, 8))
+        live.script = ResectionScript(scripted(random))
         step(
             live,
             settings=settings,
@@ -102,7 +113,13 @@ def test_a_session_replays_from_its_beginning_and_from_anywhere(often, tmp_path,
     digest = written(tmp_path / "session", 150, seed)
     log = read_log(tmp_path / "session")
     assert len(log.poses) == 150 and len(log.states) >= 10 and log.summary == {"presses": 1}
-    assert {event.kind for each in log.events.values() for event in each} >= {"back", "solver", "settings"}
+    assert {event.kind for each in log.events.values() for event in each} >= {
+        "back",
+        "solver",
+        "settings",
+        "marks",
+        "cut",
+    }
     for at_s in (0.0, 3.0, 7.6, 9.999, 13.0, 1000.0):
         replay = played(log, at_s)
         assert replay.differs_s is None and replay.rehearsal.digest() == digest, at_s

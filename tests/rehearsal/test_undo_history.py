@@ -12,6 +12,8 @@ import trimesh
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.pressed_organ import PressedOrgan, Step
 from rehearsal.rehearsal import RehearsalState
+from rehearsal.resection.resection_state import NO_RESECTION, Resection
+from rehearsal.resection.score_line import ResectionError
 from rehearsal.sessions.session import MOST_UNDONE, SETTLED, History, Session
 from render.viewer import Controls, Settings
 from scenes.tissue import NeoHookeanTissue
@@ -40,6 +42,8 @@ class Numbers:
         )
         self.pose = self.manipulator.pose()
         self.young_kpa, self.steps = 15.0, 0
+        self.resection, self.origin = NO_RESECTION, np.zeros(3)
+        self.whole_organ, self.whole_tumour = ball, None
         self.position = np.arange(6, dtype=np.float32).reshape(2, 3)
         self.velocity = np.zeros((2, 3), np.float32)
         self.contacts = {"plane": np.zeros((2, 4), np.float32)}
@@ -51,16 +55,32 @@ class Numbers:
 
     def snapshot(self, manipulator: ManipulatorState | None = None) -> RehearsalState:
         held = manipulator or self.manipulator.state
-        return RehearsalState(self._solver(), self.watch, self.pose, self.steps, held)
+        return RehearsalState(self._solver(), self.watch, self.pose, self.steps, held, self.resection)
+
+    @property
+    def body(self) -> SimpleNamespace:
+        return SimpleNamespace(snapshot=lambda: BodyState(self.position, self.velocity))
+
+    @property
+    def cut(self) -> SimpleNamespace | None:
+        return None if self.resection.cut is None else SimpleNamespace(warnings=())
+
+    def set_resection(self, resection: Resection) -> None:
+        if resection.cut is not None and not resection.marks:
+            raise ResectionError("a cut without a score")
+        self.resection = resection
 
     def restore(self, state: RehearsalState) -> None:
         self.position, self.velocity = state.solver.body.position, state.solver.body.velocity
         self.contacts, self.watch = state.solver.history, state.divergence
         self.pose, self.steps, self.manipulator.state = state.pose, state.steps, state.manipulator
+        self.resection = state.resection
 
     def advance(self, pose: np.ndarray) -> None:
-        """Each step turns on what was told, on the contacts, and on what the guard remembers."""
+        """Each step depends on the settings, the contacts, the divergence check's state, the marks and the cut."""
         told = 1e-3 * self.young_kpa + 1e-2 * self.settings.iterations + 1e-3 * self.settings.gravity[2]
+        cut = self.resection.cut
+        told += 0.1 * len(self.resection.marks) + (0.0 if cut is None else 0.3 + 1e-3 * cut.nodes_mm.sum())
         drawn = self.contacts["plane"][:, :3] + 0.01 * (self.watch.steps_since_good % 7)
         self.velocity = (0.9 * self.velocity + told + drawn + 0.01 * pose[:3, 3]).astype(np.float32)
         length_s = np.float32(self.settings.time_step_s)

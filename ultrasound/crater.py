@@ -1,0 +1,61 @@
+"""A crater: the place of removed tissue in volumes at rest, with fluid or air in it."""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+import trimesh
+
+from sim.signed_distance import signed_distance
+from ultrasound.acoustics import properties
+from ultrasound.sampled_volume import AIR_HU, SampledVolume
+
+Filling = Literal["fluid", "air"]
+FILLINGS: tuple[Filling, ...] = get_args(Filling)
+# HU of each, and the tissue whose acoustic values it has, where it has a tissue's: irrigation fluid with some blood is as urine.
+HU: dict[Filling, float] = {"fluid": 10.0, "air": AIR_HU}
+TISSUE: dict[Filling, str] = {"fluid": "urine"}
+Box = tuple[slice, slice, slice]
+
+
+@dataclass(frozen=True)
+class Crater:
+    """The inside of a closed surface at rest [mm], and what fills it."""
+
+    surface: trimesh.Trimesh
+    filling: Filling
+
+    def hu(self) -> np.ndarray:
+        """HU in it, shape ()."""
+        return np.array(HU[self.filling], np.float32)
+
+    def acoustics(self) -> np.ndarray:
+        """Acoustic properties (4,) in it, as ``acoustics.properties``."""
+        hu = np.full((1, 1, 1), round(HU[self.filling]), np.int32)
+        tissue = TISSUE.get(self.filling)
+        labels = np.zeros((1, 1, 1), np.int32) if tissue is None else np.ones((1, 1, 1), np.int32)
+        return properties(hu, labels, {} if tissue is None else {1: tissue})[0, 0, 0]
+
+    def distance(self, volume: SampledVolume) -> tuple[Box, np.ndarray]:
+        """The voxels of a volume in it and around it, and their signed distances [mm] from its surface, negative inside."""
+        linear, offset = volume.index_from_mm[:3, :3], volume.index_from_mm[:3, 3]
+        corners = np.asarray(self.surface.vertices) @ linear.T + offset
+        low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 1, 0, volume.shape)
+        high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 2, 0, volume.shape)
+        box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        points = (np.indices(high - low).reshape(3, -1).T + low - offset) @ np.linalg.inv(linear).T
+        found = signed_distance(self.surface.vertices, self.surface.faces, points)[0]
+        return box, found.reshape(high - low)  # type: ignore[return-value]
+
+    def replaced(self, volume: SampledVolume, value: np.ndarray) -> tuple[Box, np.ndarray]:
+        """Voxels of a volume, and their values with another value in the crater, by the share of each voxel that is in it."""
+        box, distance = self.distance(volume)
+        share = np.clip(0.5 - distance / volume.voxel_mm, 0, 1).astype(np.float32)
+        before = volume.values(box)
+        share = share.reshape(share.shape + (1,) * (before.ndim - 3))
+        return box, before + share * (value - before)
+
+    def without(self, volume: SampledVolume) -> tuple[Box, np.ndarray]:
+        """Voxels of a volume of signed distances [mm], and these without the crater: negative in what remains."""
+        box, distance = self.distance(volume)
+        return box, np.maximum(volume.values(box), -distance)
