@@ -11,7 +11,7 @@ from rehearsal.image_and_surface_files import save_image_file, save_surfaces
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import summary
 from rehearsal.notices import Notices
-from rehearsal.open_window import open_viewer, probe_with_settings
+from rehearsal.open_window import geometry_of, open_viewer, probe_with_settings
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import write_json
 from render.animation import ANIMATION_FPS, empty_folder, save_animation, scaled_down, side_by_side
@@ -28,6 +28,7 @@ class Pictures:
 
     def __init__(self, rehearsal: Rehearsal, steps: int, out: Path) -> None:
         self.steps, self.out = steps, out
+        self._rehearsal, self._shown_cut = rehearsal, rehearsal.cut
         self.viewer: Window | None = None
         try:
             self.viewer = open_viewer(rehearsal, visible=False)
@@ -48,6 +49,9 @@ class Pictures:
         picture = side_by_side(view)
         save_image_file(picture, self._slices / f"{step:05d}.png")
         if self.viewer is not None:
+            if self._rehearsal.cut is not self._shown_cut:
+                self._shown_cut = self._rehearsal.cut
+                self.viewer.change_geometry(geometry_of(self._rehearsal))
             self.viewer.draw(measurements.onto(view, settings))
             picture = Image.fromarray(self.viewer.picture())
             save_image_file(picture, self._frames / f"{step:05d}.png")
@@ -93,7 +97,9 @@ def run_headless(
     drawn = [pictures.save()] if pictures is not None else []
     report = tally.report(rehearsal, arch) | dict(reading=frames.measurements.figures())
     if rehearsal.judgement is not None:
-        report |= dict(resection=rehearsal.judgement.report())
+        from rehearsal.resection.resection_page import report_of
+
+        report |= dict(resection=report_of(rehearsal))
     write_json(report, out / "report.json")
     click.echo(summary(report))
     click.echo(f"Wrote {' and '.join([*drawn, 'report.json'])} to {out}")

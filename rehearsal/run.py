@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import click
 import numpy as np
@@ -193,9 +194,24 @@ class RehearsalRun:
             self._end(source.bookmarks)
             _echo(_verdict(replay))
 
+    def _judged(self) -> dict[str, Any]:
+        """Write the page of the resection and print its figures; return them."""
+        # Matplotlib takes half a second to import.
+        from rehearsal.resection.resection_page import report_of, rows_of, save_page
+
+        report = report_of(self.rehearsal)
+        click.echo("\n".join(f"{name:<20}  {value}" for name, value in rows_of(report)))
+        try:
+            click.echo("Saved " + " and ".join(map(str, save_page(self.rehearsal, self.asked.out))))
+        except OSError as error:
+            click.echo(f"Warning: the page of the resection is not saved: {error.strerror}")
+        return report
+
     def _end(self, bookmarks: int) -> None:
         summary = self.measurements.summary(bookmarks)
         click.echo(summary_text(summary))
+        if self.rehearsal.judgement is not None:
+            summary |= dict(resection=self._judged())
         guide = self.measurements.guide
         if guide is not None:
             _echo(guide.in_words(summary.get(f"seen_{guide.plan.target}")))

@@ -219,3 +219,19 @@ def _vessel_at(points: np.ndarray, labels: Grid | None, tissues: Mapping[int, st
     names = [tissues.get(int(value), "") for value in labels.voxels[tuple(index.T)]]
     counts = {name: names.count(name) for name in VESSELS}
     return max(counts, key=counts.__getitem__) if any(counts.values()) else "vessel"
+
+
+def findings_of(judgement: Judgement) -> dict[str, str]:
+    """Name -> figure with its unit, of a cut, for the window."""
+    margin = judgement.margin
+    found = {
+        "least margin": f"{margin.margin_mm.min():.1f} mm",
+        "positive margin": f"{margin.area_below(0.0):.0f} mm2",
+        "specimen": f"{judgement.specimen_ml:.1f} ml",
+        "parenchyma": f"-{judgement.parenchyma_removed_ml:.1f} ml ({judgement.parenchyma_removed_percent:.1f} %)",
+        "calyces opened": f"{judgement.collecting_system_opened_mm2:.0f} mm2",
+    }
+    if judgement.vessels:
+        widest = judgement.vessels[0]
+        found["vessels cut"] = f"{len(judgement.vessels)}, {widest.tissue} {widest.diameter_mm:.1f} mm"
+    return found
