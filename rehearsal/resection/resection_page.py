@@ -1,5 +1,6 @@
 """The page of a resection: the margin as a map on the specimen, and its figures; as PNG and JSON."""
 
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ COLOURS = ("#7a0016", "#e5383b", "#f48c06", "#ffd60a", "#52b788")
 CAPSULE = "#c9b8ae"
 # Views of the specimen along the axes of the score's frame: title, direction from which it is seen, and what is up.
 VIEWS = (("resection surface, from below", (0, 0, -1), (0, 1, 0)), ("from the side", (0, -1, 0), (0, 0, 1)))
+TEXT_WIDTH = 40
 LIGHT = np.array([0.4, 0.6, 0.7])
 
 
@@ -81,7 +83,7 @@ def _colours(distance_mm: np.ndarray, cut: Cut) -> np.ndarray:
     return colours
 
 
-def _draw_specimen(axes: Axes, faces: np.ndarray, colours: np.ndarray, title: str) -> None:
+def _draw_specimen(axes: Any, faces: np.ndarray, colours: np.ndarray, title: str) -> None:
     """Draw faces (f, 3, 3) in the axes right, up, towards the eye."""
     normal = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
@@ -134,10 +136,12 @@ def _draw_legend(figure: Figure) -> None:
 def _draw_figures(figure: Figure, report: dict[str, Any]) -> None:
     rows = rows_of(report)
     figure.text(0.03, 0.93, "Resection", fontsize=17, weight="bold")
-    for number, (name, value) in enumerate(rows):
-        height = 0.93 - 0.043 * number
-        figure.text(0.62, height, name, fontsize=10.5, color="#555555")
-        figure.text(0.745, height, value, fontsize=10.5)
+    height = 0.93
+    for name, value in rows:
+        figure.text(0.62, height, name, fontsize=10.5, color="#555555", va="top")
+        lines = textwrap.wrap(value, TEXT_WIDTH)
+        figure.text(0.755, height, "\n".join(lines), fontsize=10.5, va="top")
+        height -= 0.038 * len(lines)
 
 
 def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
