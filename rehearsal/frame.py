@@ -27,6 +27,7 @@ from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.real_time.solver_process import SolverProcess
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.cut import Cut
+from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.resection_view import ResectionView, cut_settings
 from rehearsal.stopwatch import timed
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer, send_live
@@ -62,10 +63,11 @@ class Frames(Generic[Source]):
     measurements: LiveMeasurements
     tally: Tally
     link: OpenIGTLinkServer | None = None
+    resection_plan: ResectionPlan | None = None
     resection: ResectionView = field(init=False)
 
     def __post_init__(self) -> None:
-        self.resection = ResectionView(self.rehearsal)
+        self.resection = ResectionView(self.rehearsal, self.resection_plan)
 
     def input(self, controls: Controls) -> np.ndarray | None:
         """Return the transducer's next pose (4, 4); None if this frame makes no step."""

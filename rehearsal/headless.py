@@ -99,7 +99,7 @@ def run_headless(
     if rehearsal.judgement is not None:
         from rehearsal.resection.resection_page import report_of
 
-        report |= dict(resection=report_of(rehearsal))
+        report |= dict(resection=report_of(rehearsal, frames.resection_plan))
     write_json(report, out / "report.json")
     click.echo(summary(report))
     click.echo(f"Wrote {' and '.join([*drawn, 'report.json'])} to {out}")

@@ -94,6 +94,7 @@ class RehearsalRun:
             sweeping=SweepRecorder(self.rehearsal, self.notices),
             plans=PlanControl(self.rehearsal, self.anatomy, self.measurements, self.asked.out, self.notices),
             keys=self.files.keys,
+            resection_plan=self.files.resection_plan,
         )
         prepare(frames)
         try:
@@ -115,7 +116,14 @@ class RehearsalRun:
             source, steps = self._tracked_input(self.files.track)
         else:
             source, steps = self._scripted_input()
-        frames = Frames(self.rehearsal, source, self.measurements, Tally(self.build_s), self.link)
+        frames = Frames(
+            self.rehearsal,
+            source,
+            self.measurements,
+            Tally(self.build_s),
+            self.link,
+            self.files.resection_plan,
+        )
         with self._summarised(source, replay):
             run_headless(
                 frames, self.notices, steps, settings, self.arch, self.asked.out, not self.asked.no_pictures
@@ -199,10 +207,10 @@ class RehearsalRun:
         # Matplotlib takes half a second to import.
         from rehearsal.resection.resection_page import report_of, rows_of, save_page
 
-        report = report_of(self.rehearsal)
+        report = report_of(self.rehearsal, self.files.resection_plan)
         click.echo("\n".join(f"{name:<20}  {value}" for name, value in rows_of(report)))
         try:
-            click.echo("Saved " + " and ".join(map(str, save_page(self.rehearsal, self.asked.out))))
+            click.echo("Saved " + " and ".join(map(str, save_page(self.rehearsal, report, self.asked.out))))
         except OSError as error:
             click.echo(f"Warning: the page of the resection is not saved: {error.strerror}")
         return report

@@ -210,20 +210,24 @@ class ScoreLines:
 
     def __init__(self) -> None:
         self._points, self._colours = (
-            ti.Vector.field(3, ti.f32, 2 * (MAX_SCORE + 2 * MAX_MARKS)) for _ in range(2)
+            ti.Vector.field(3, ti.f32, 4 * (MAX_SCORE + MAX_MARKS)) for _ in range(2)
         )
 
     def draw(self, scene, score: Score, toward: np.ndarray) -> None:
         """Draw the lines into a scene, lifted a little off the surface, ``toward`` (3,) the eye."""
-        every = max(1, -(-len(score.line_mm) // MAX_SCORE))
-        line, near = score.line_mm[::every], score.is_near[::every]
-        sides = np.stack([line, np.roll(line, -1, axis=0)], axis=1)
+        line, near = thinned(score.line_mm), thinned(score.is_near)
         across = np.linalg.svd(toward[None])[2][1:]
         crosses = score.marks_mm[:, None, None] + MARK_MM * np.stack([across, -across], axis=1)
-        segments = np.concatenate([sides, crosses.reshape(-1, 2, 3)]) + SCORE_LIFT_MM * toward
-        colours = np.where(
-            np.concatenate([near, np.zeros(2 * len(score.marks_mm), bool)])[:, None], NEAR, SCORED
+        planned = closed(thinned(score.planned_mm))
+        drawn = (
+            (planned, np.tile(TO_GO, (len(planned), 1))),
+            (closed(line), np.where(near[:, None], NEAR, SCORED)),
+            (crosses.reshape(-1, 2, 3), np.tile(SCORED, (2 * len(crosses), 1))),
         )
+        segments, colours = (np.concatenate([each[k] for each in drawn]) for k in range(2))
+        segments = segments + SCORE_LIFT_MM * toward
+        if len(segments) == 0:
+            return
         count = 2 * len(segments)
         # Unused segments have no length.
         points = np.repeat(segments[-1:, 1], self._points.shape[0], axis=0).astype(np.float32)
@@ -232,3 +236,13 @@ class ScoreLines:
         shades[:count] = np.repeat(colours, 2, axis=0)
         fill((self._points, points), (self._colours, shades))
         scene.lines(self._points, SCORE_WIDTH, per_vertex_color=self._colours)
+
+
+def thinned(line: np.ndarray) -> np.ndarray:
+    """Every n-th point of a line (k, ...), so that there are no more than MAX_SCORE."""
+    return line[:: max(1, -(-len(line) // MAX_SCORE))]
+
+
+def closed(line: np.ndarray) -> np.ndarray:
+    """The segments (k, 2, 3) of a closed line (k, 3)."""
+    return np.stack([line, np.roll(line, -1, axis=0)], axis=1)

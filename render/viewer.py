@@ -166,6 +166,8 @@ class Score:
     """Shape (n, 3)."""
     is_near: np.ndarray
     """Whether each point of the line is nearer to the tumour than the margin asks, bool, shape (k,)."""
+    planned_mm: np.ndarray
+    """Points of the planned closed line, shape (p, 3); none of it without a plan."""
 
 
 @dataclass(frozen=True)

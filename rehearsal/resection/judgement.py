@@ -24,6 +24,8 @@ MARGIN_LIMITS_MM = (1.0, 3.0, 5.0)
 # Parts of an organ that are not parenchyma.
 NOT_PARENCHYMA = ("tumour", "cyst", "urine", "vessel", "sinus")
 VESSELS = ("artery", "vein", "vessel")
+# A cut that is no farther inside a surface runs along it.
+SURFACE_ERROR_MM = 0.1
 # A cut of less area through a vessel or the collecting system is within the error of their surfaces.
 LEAST_OPENED_MM2 = 0.5
 
@@ -58,6 +60,11 @@ class MarginMap:
         """Area [mm^2] with less margin than a limit."""
         return float(self.area_mm2[self.distance_mm < limit_mm].sum())
 
+    @property
+    def positive_mm2(self) -> float:
+        """Area [mm^2] of the cut in the tumour."""
+        return self.area_below(-SURFACE_ERROR_MM)
+
 
 @dataclass(frozen=True)
 class Judgement:
@@ -88,7 +95,7 @@ class Judgement:
                 f"margin_below_{limit:g}_mm2": round(margin.area_below(limit), 1)
                 for limit in MARGIN_LIMITS_MM
             },
-            positive_margin_mm2=round(margin.area_below(0.0), 1),
+            positive_margin_mm2=round(margin.positive_mm2, 1),
             tumour_left_ml=round(self.tumour_left_ml, 3),
             specimen_ml=round(float(self.specimen_ml), 3),
             parenchyma_removed_ml=round(self.parenchyma_removed_ml, 3),
@@ -226,7 +233,7 @@ def findings_of(judgement: Judgement) -> dict[str, str]:
     margin = judgement.margin
     found = {
         "least margin": f"{margin.margin_mm.min():.1f} mm",
-        "positive margin": f"{margin.area_below(0.0):.0f} mm2",
+        "positive margin": f"{margin.positive_mm2:.0f} mm2",
         "specimen": f"{judgement.specimen_ml:.1f} ml",
         "parenchyma": f"-{judgement.parenchyma_removed_ml:.1f} ml ({judgement.parenchyma_removed_percent:.1f} %)",
         "calyces opened": f"{judgement.collecting_system_opened_mm2:.0f} mm2",

@@ -15,6 +15,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.cut import Cut
 from rehearsal.resection.judgement import MARGIN_LIMITS_MM, Judgement
+from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.score_line import ResectionError
 from rehearsal.result_files import save_figure, write_json
 from scenes.surfaces import signed_distance_from
@@ -29,8 +30,8 @@ TEXT_WIDTH = 40
 LIGHT = np.array([0.4, 0.6, 0.7])
 
 
-def report_of(rehearsal: Rehearsal) -> dict[str, Any]:
-    """The figures of a cut, and how it was made, for ``report.json``. Raises ResectionError without a cut."""
+def report_of(rehearsal: Rehearsal, plan: ResectionPlan | None = None) -> dict[str, Any]:
+    """The figures of a cut, how it was made, and its comparison with a plan, for ``report.json``. Raises ResectionError without a cut."""
     judgement, request = rehearsal.judgement, rehearsal.resection.cut
     if judgement is None or request is None:
         raise ResectionError("nothing was cut, or there is no tumour to judge by")
@@ -44,12 +45,13 @@ def report_of(rehearsal: Rehearsal) -> dict[str, Any]:
         filling=asked.filling,
         tumour_seen_percent=round(100 * seen, 1),
         **judgement.report(),
+        **({} if plan is None else dict(against_plan=plan.compared(judgement))),
     )
 
 
-def save_page(rehearsal: Rehearsal, out: Path) -> list[Path]:
-    """Write ``resection.png`` and ``resection.json`` into a folder; return them. Raises ResectionError, OSError."""
-    report, cut, judgement = report_of(rehearsal), rehearsal.cut, rehearsal.judgement
+def save_page(rehearsal: Rehearsal, report: dict[str, Any], out: Path) -> list[Path]:
+    """Write ``resection.png`` and ``resection.json`` with a report into a folder; return them. Raises ResectionError, OSError."""
+    cut, judgement = rehearsal.cut, rehearsal.judgement
     if cut is None or judgement is None or rehearsal.whole_tumour is None:
         raise ResectionError("nothing was cut, or there is no tumour to judge by")
     figure = Figure(figsize=(13.5, 6.0), facecolor="white")
@@ -151,6 +153,17 @@ def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
     shown = ", ".join(vessels[:3]) + (f" and {len(vessels) - 3} more" if len(vessels) > 3 else "")
     below = ", ".join(f"{report[f'margin_below_{limit:g}_mm2']:.0f}" for limit in MARGIN_LIMITS_MM)
     limits = ", ".join(f"{limit:g}" for limit in MARGIN_LIMITS_MM)
+    plan = report.get("against_plan")
+    against = (
+        []
+        if plan is None
+        else [
+            (
+                "against the plan",
+                f"{plan['cost_ml']:.1f} ml, planned {plan['planned_cost_ml']:.1f} ml by {plan['planned_technique']}",
+            )
+        ]
+    )
     return [
         ("technique", f"{report['technique']}, {depth}; {report['filling']} in the crater"),
         ("tumour seen", f"{report['tumour_seen_percent']:.0f} % of its surface"),
@@ -175,4 +188,5 @@ def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
         ("collecting system", f"{report['collecting_system_opened_mm2']:.0f} mm2 opened"),
         ("vessels cut", shown or "none"),
         ("bed", f"{report['bed_mm2'] / 100:.1f} cm2"),
+        *against,
     ]

@@ -5,6 +5,7 @@ import numpy as np
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.cut import Cut, CutSettings, cut_organ
 from rehearsal.resection.operation import IsSeen, distance_to_tumour
+from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.score_line import ResectionError
 from render.viewer import Score, Settings
 from sim.fields import array_of
@@ -26,11 +27,15 @@ def cut_settings(settings: Settings) -> CutSettings:
 class ResectionView:
     """The score and the coming resection surface of a rehearsal.
 
-    ``fault`` says why a cut is not possible now; ``tumour_mm`` (k,) are the distances of the score's points from the tumour's outline.
+    ``plan`` is what is to be followed, if anything. ``fault`` says why a cut is not possible now; ``tumour_mm`` (k,) are the distances of the score's points from the tumour's outline.
     """
 
-    def __init__(self, rehearsal: Rehearsal) -> None:
-        self.rehearsal = rehearsal
+    def __init__(self, rehearsal: Rehearsal, plan: ResectionPlan | None = None) -> None:
+        self.rehearsal, self.plan = rehearsal, plan
+        self._plan_skin: Skin | None = None
+        if plan is not None:
+            line = np.array(plan.best.line_mm) - rehearsal.origin
+            self._plan_skin = Skin(rehearsal.model, line)
         self.fault = ""
         self.tumour_mm = np.zeros(0)
         self._planned: Cut | None = None
@@ -68,12 +73,16 @@ class ResectionView:
         return plane_section(array_of(self._skin.vertices).astype(float), faces, plane_from_world)
 
     def score(self, margin_mm: float) -> Score | None:
-        """The score as it lies now, None without marks; a part is near where its margin is smaller than asked."""
-        if not self.rehearsal.resection.marks:
+        """The score and the planned one as they lie now, None without either; a part is near where its margin is smaller than asked."""
+        if not self.rehearsal.resection.marks and self._plan_skin is None:
             return None
+        planned = np.zeros((0, 3))
+        if self._plan_skin is not None and self.rehearsal.cut is None:
+            self._plan_skin.update()
+            planned = array_of(self._plan_skin.vertices).astype(float)
         line, marks = self.rehearsal.score_points()
         near = self.tumour_mm < margin_mm - TOLERANCE_MM if len(self.tumour_mm) else np.zeros(len(line), bool)
-        return Score(line, marks, near)
+        return Score(line, marks, near, planned)
 
     def status(self, settings: CutSettings) -> str:
         """The text over the images while scoring; empty before the first mark and after the cut."""
