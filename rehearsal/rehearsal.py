@@ -18,7 +18,7 @@ from rehearsal.resection.resection_state import NO_RESECTION, Resection
 from rehearsal.resection.score_line import LEAST_MARKS, ResectionError, ScoreLine, score_line
 from scenes.anatomy import Grid, LoadedAnatomy
 from scenes.scene import Scene
-from scenes.surfaces import translated, volume_mm3
+from scenes.surfaces import signed_distance_from, translated, volume_mm3
 from scenes.terminal import ReportProgress, no_progress
 from sim.embedding import Embedding
 from sim.fields import array_of
@@ -218,8 +218,17 @@ class Rehearsal(PressedOrgan):
             tumour = np.zeros((0, 3)) if self.whole_tumour is None else np.asarray(self.whole_tumour.vertices)
             seen = tumour[resection.cut.seen_of(len(tumour))]
             made = cut_organ(self.whole_organ, line, resection.cut.settings, seen)
+            self._check_hilum(made)
             self._cuts = dict([*self._cuts.items(), (resection, made)][-KEPT_CUTS:])
         return self._cuts[resection]
+
+    def _check_hilum(self, cut: Cut) -> None:
+        """Raises ResectionError where the specimen would contain the hilum."""
+        hilum = self.scene.attachment.at_mm
+        if hilum is not None and signed_distance_from(cut.specimen, np.array([hilum]) - self.origin)[0] < 0:
+            raise ResectionError(
+                "the cut goes through the hilum, with the kidney's vessels; set the score nearer to the tumour"
+            )
 
     def apply_cut(self, cut: Cut | None) -> None:
         super().apply_cut(cut)

@@ -68,7 +68,7 @@ KEY_MAP = {
         "stop planning; or show the next sweep, then none": {"next_plan": "Backspace"},
     },
     "Session": {
-        "undo the last press, turn or path; redo it": {"undo": "U", "redo": "Y"},
+        "undo the last press, turn, path, mark or cut; redo it": {"undo": "U", "redo": "Y"},
         "set a bookmark; return to bookmarks": {"bookmark": "M", "to_bookmark": "J"},
         "start and stop recording a tracked sweep": {"sweep": "L"},
         "take control from a replay or a tracked probe": {"take_over": "K"},

@@ -166,9 +166,13 @@ class UserInput:
     def _cut(self, settings: CutSettings) -> None:
         coverage = self.session.coverage
         cut(self.session, settings, None if coverage is None else coverage().is_seen)
-        made = self.session.rehearsal.cut
-        for warning in made.warnings if made is not None else ():
-            self._show(warning)
+        made, judgement = self.session.rehearsal.cut, self.session.rehearsal.judgement
+        warnings = [
+            *(made.warnings if made is not None else ()),
+            *(judgement.warnings() if judgement is not None else ()),
+        ]
+        for warning in warnings:
+            self.notices.post(f"Warning: {warning}")
 
     def _act(self, action: Callable[[], None]) -> None:
         """Do something that undo reverts; say why it cannot be done."""

@@ -24,6 +24,8 @@ MARGIN_LIMITS_MM = (1.0, 3.0, 5.0)
 # Parts of an organ that are not parenchyma.
 NOT_PARENCHYMA = ("tumour", "cyst", "urine", "vessel", "sinus")
 VESSELS = ("artery", "vein", "vessel")
+# Segmental vessels are narrower.
+MAIN_VESSEL_MM = 5.0
 # A cut that is no farther inside a surface runs along it.
 SURFACE_ERROR_MM = 0.1
 # A cut of less area through a vessel or the collecting system is within the error of their surfaces.
@@ -82,6 +84,20 @@ class Judgement:
     collecting_system_opened_mm2: float
     vessels: tuple[DividedVessel, ...]
     volume_change_percent: float
+
+    def warnings(self) -> list[str]:
+        """What a surgeon would want to know at once."""
+        found = []
+        if self.margin.positive_mm2 > 0:
+            found.append(
+                f"the cut goes through the tumour over {self.margin.positive_mm2:.0f} mm2; {self.tumour_left_ml:.1f} ml of it are left"
+            )
+        wide = [vessel for vessel in self.vessels if vessel.diameter_mm >= MAIN_VESSEL_MM]
+        if wide:
+            found.append(
+                f"the cut divides a {wide[0].tissue} of {wide[0].diameter_mm:.1f} mm, as wide as a main vessel"
+            )
+        return found
 
     def report(self) -> dict:
         """The figures for ``report.json``."""
