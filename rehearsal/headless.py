@@ -17,7 +17,9 @@ from rehearsal.result_files import write_json
 from render.animation import ANIMATION_FPS, empty_folder, save_animation, scaled_down, side_by_side
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan, Window
+from scenes.anatomy import LoadedAnatomy
 from scenes.atomic_files import atomic_write
+from scenes.tumour_complexity import complexity
 
 # An animation is held in memory: a long session has fewer images in it.
 MOST_SHOWN = 240
@@ -67,6 +69,7 @@ class Pictures:
 
 def run_headless(
     frames: Frames,
+    anatomy: LoadedAnatomy,
     notices: Notices,
     steps: int,
     settings: Settings,
@@ -95,7 +98,10 @@ def run_headless(
         notices.present()
     save_surfaces(rehearsal, out)
     drawn = [pictures.save()] if pictures is not None else []
-    report = tally.report(rehearsal, arch) | dict(reading=frames.measurements.figures())
+    found = complexity(anatomy, rehearsal.scene.attachment.at_mm)
+    report = tally.report(rehearsal, arch) | dict(
+        complexity=None if found is None else found.figures(), reading=frames.measurements.figures()
+    )
     if rehearsal.judgement is not None:
         from rehearsal.resection.resection_page import report_of
 

@@ -126,7 +126,14 @@ class RehearsalRun:
         )
         with self._summarised(source, replay):
             run_headless(
-                frames, self.notices, steps, settings, self.arch, self.asked.out, not self.asked.no_pictures
+                frames,
+                self.anatomy,
+                self.notices,
+                steps,
+                settings,
+                self.arch,
+                self.asked.out,
+                not self.asked.no_pictures,
             )
 
     def _replayed_steps(self, replay: Replay) -> int:
