@@ -7,6 +7,7 @@ Polar lines: between them, the medial lip of the parenchyma is interrupted by re
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import trimesh
@@ -19,8 +20,10 @@ from scenes.surfaces import signed_distance_from
 LESION_MM = 2.0
 # Tissue this deep under the organ's surface decides whether the surface is parenchyma or opens into the sinus.
 UNDER_SURFACE_MM = 1.0
-# The hilar concavity: deeper than this share of its greatest depth; a kidney without one of this depth shows no hilum.
+# The hilar concavity is where the contour is farther from the organ than this share of the greatest distance. Without a distance of
+# LEAST_CONCAVITY_MM near the hilum there is none. The contour is sampled every MOUTH_MM.
 CONCAVITY_SHARE, LEAST_CONCAVITY_MM = 0.5, 2.0
+NEAR_HILUM_MM, MOUTH_MM = 30.0, 3.0
 OPENING = ("sinus", "urine", "vessel")
 
 
@@ -63,8 +66,8 @@ def kidney_axes(
 ) -> KidneyAxes:
     """The axes of a kidney.
 
-    The polar axis is the axis of least inertia of the contour. The hilum is the centre of the surface that opens into the labelled
-    sinus, or else ``hilum_mm``.
+    The polar axis is the axis of least inertia of the contour. The hilum is the surface that opens into the labelled sinus, or else
+    the mouth of the concavity near ``hilum_mm``.
 
     Args:
         organ: surface [mm, LPS] with its tumours and cysts.
@@ -76,16 +79,19 @@ def kidney_axes(
     contour = trimesh.convex.convex_hull(organ.vertices[own])
     centre, polar = contour.center_mass, contour.principal_inertia_vectors[0]
     polar = polar * (-1.0 if polar[2] < 0 else 1.0)
-    opening = _sinus_opening(organ, parts, own) if "sinus" in parts else np.zeros(len(own), bool)
-    measured = bool(opening.any())
-    if measured:
-        hilum_mm = organ.vertices[opening].mean(axis=0)
-    elif hilum_mm is not None:
-        opening = _concavity(organ, contour, own, np.asarray(hilum_mm, float))
-    polar_lines = _ends(organ.vertices[opening], centre, polar)
-    sinus_lines = _ends(parts["sinus"].vertices, centre, polar) if "sinus" in parts else polar_lines
+    hilum = _sinus_opening(organ, parts, own) if "sinus" in parts else np.empty((0, 3))
+    measured = len(hilum) > 0
+    if not measured and hilum_mm is not None:
+        hilum = _concavity(organ, contour, np.asarray(hilum_mm, float))
+    polar_lines = _ends(hilum, centre, polar)
     return KidneyAxes(
-        contour, centre, polar, _across(hilum_mm, centre, polar), polar_lines, sinus_lines, not measured
+        contour,
+        centre,
+        polar,
+        hilar=_across(hilum, centre, polar),
+        polar_lines=polar_lines,
+        sinus_lines=_ends(parts["sinus"].vertices, centre, polar) if "sinus" in parts else polar_lines,
+        estimated=not measured,
     )
 
 
@@ -98,32 +104,32 @@ def _off_lesions(organ: trimesh.Trimesh, lesions: Sequence[trimesh.Trimesh]) -> 
 
 
 def _sinus_opening(organ: trimesh.Trimesh, parts: dict[str, trimesh.Trimesh], own: np.ndarray) -> np.ndarray:
-    """Which vertices (n,) have sinus, collecting system or a vessel under them instead of parenchyma: the largest such piece."""
+    """Vertices (n, 3) with sinus, collecting system or a vessel under them instead of parenchyma: the largest piece of such surface."""
     under = organ.vertices - UNDER_SURFACE_MM * organ.vertex_normals
     inside = [signed_distance_from(parts[tissue], under) < 0 for tissue in OPENING if tissue in parts]
     opens = own & np.any(inside, axis=0)
     if not opens.any():
-        return opens
+        return np.empty((0, 3))
     piece = _pieces(organ, opens)
     # A vessel in thin parenchyma is a piece by itself.
-    return opens & (piece == np.bincount(piece[opens]).argmax())
+    return organ.vertices[piece == np.bincount(piece[opens]).argmax()]
 
 
-def _concavity(
-    organ: trimesh.Trimesh, contour: trimesh.Trimesh, own: np.ndarray, hilum_mm: np.ndarray
-) -> np.ndarray:
-    """Which vertices (n,) are in the hilar concavity: deep below the contour, and connected to the hilum."""
-    depth = np.where(own, -signed_distance_from(contour, organ.vertices), 0.0)
-    nearest = int(np.argmin(np.linalg.norm(organ.vertices - hilum_mm, axis=1)))
-    if depth[nearest] < LEAST_CONCAVITY_MM:
-        return np.zeros(len(own), bool)
-    piece = _pieces(organ, depth >= CONCAVITY_SHARE * depth[nearest])
-    return piece == piece[nearest]
+def _concavity(organ: trimesh.Trimesh, contour: trimesh.Trimesh, hilum_mm: np.ndarray) -> np.ndarray:
+    """Points (n, 3) of the contour over the hilar concavity: the mouth of the hilum between the lips of the parenchyma."""
+    fine = cast(trimesh.Trimesh, contour.subdivide_to_size(MOUTH_MM))
+    gap = signed_distance_from(organ, fine.vertices)
+    near = np.linalg.norm(fine.vertices - hilum_mm, axis=1) <= NEAR_HILUM_MM
+    middle = int(np.argmax(np.where(near, gap, 0.0)))
+    if gap[middle] < LEAST_CONCAVITY_MM or not near[middle]:
+        return np.empty((0, 3))
+    piece = _pieces(fine, gap >= CONCAVITY_SHARE * gap[middle])
+    return fine.vertices[piece == piece[middle]]
 
 
-def _pieces(organ: trimesh.Trimesh, chosen: np.ndarray) -> np.ndarray:
+def _pieces(surface: trimesh.Trimesh, chosen: np.ndarray) -> np.ndarray:
     """The number (n,) of the connected piece of each vertex, along edges between chosen vertices."""
-    edges = organ.edges_unique[chosen[organ.edges_unique].all(axis=1)]
+    edges = surface.edges_unique[chosen[surface.edges_unique].all(axis=1)]
     graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(chosen), len(chosen)))
     return connected_components(graph, directed=False)[1]
 
@@ -135,10 +141,10 @@ def _ends(points: np.ndarray, centre: np.ndarray, polar: np.ndarray) -> tuple[fl
     return float(heights.min()), float(heights.max())
 
 
-def _across(hilum_mm: Sequence[float] | None, centre: np.ndarray, polar: np.ndarray) -> np.ndarray | None:
-    if hilum_mm is None:
+def _across(hilum: np.ndarray, centre: np.ndarray, polar: np.ndarray) -> np.ndarray | None:
+    """Unit vector (3,) from the polar axis to the middle of the hilum's points (n, 3); None without points."""
+    if len(hilum) == 0:
         return None
-    to_hilum = np.asarray(hilum_mm) - centre
+    to_hilum = hilum.mean(axis=0) - centre
     to_hilum -= polar * (to_hilum @ polar)
-    length = np.linalg.norm(to_hilum)
-    return to_hilum / length if length > 0 else None
+    return to_hilum / np.linalg.norm(to_hilum)

@@ -34,9 +34,8 @@ class Complexity:
 
     @property
     def labels_needed(self) -> list[str]:
-        """The structures whose labels would make certain what is estimated or not known."""
+        """The structures whose labels would show what is not known."""
         needed = [name for each in self._components for name in each.needs]
-        needed += ["renal sinus"] if self.estimated else []
         needed += ["renal artery and vein"] if self.tumour.touches_main_vessel is None else []
         return list(dict.fromkeys(needed))
 
@@ -55,16 +54,10 @@ class Complexity:
             ("distance", f"{near} mm"),
             ("R.E.N.A.L.", _in_words(self.renal, measures=True)),
             ("PADUA", _in_words(self.padua, measures=False)),
-            ("estimated", f"{', '.join(self.estimated)}: from the hilar concavity"),
-            ("not known", f"{', '.join(self.not_known)}"),
-            ("to know", f"label {', '.join(self.labels_needed)}"),
+            ("estimated", f"{', '.join(self.estimated)}, from the hilar concavity; label the renal sinus"),
+            ("not known", f"{', '.join(self.not_known)}; label the {', '.join(self.labels_needed)}"),
         ]
-        shown = {
-            "distance": near,
-            "estimated": self.estimated,
-            "not known": self.not_known,
-            "to know": self.labels_needed,
-        }
+        shown = {"distance": near, "estimated": self.estimated, "not known": self.not_known}
         return [row for row in rows if shown.get(row[0], True)]
 
     def figures(self) -> dict[str, Any]:
