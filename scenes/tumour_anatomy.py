@@ -94,17 +94,16 @@ def points_inside(surface: trimesh.Trimesh) -> np.ndarray:
     low, high = surface.bounds
     axes = [np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    return grid[signed_distance_from(surface, grid) < 0]
+    return grid[_inside(surface, grid)]
 
 
 def exophytic_share(points: np.ndarray, contour: trimesh.Trimesh) -> float:
-    """Share of points (n, 3) outside a convex contour.
+    """Share of points (n, 3) outside the kidney's contour.
 
     The contour is the convex hull of the kidney without the tumour, as in the computer-generated scores of Heller et al. 2022
     (J Urol 207, 1105), but in space instead of on axial slices, so that it follows the kidney's long axis.
     """
-    offsets = np.einsum("ij,ij->i", contour.face_normals, contour.triangles[:, 0])
-    return float((points @ contour.face_normals.T > offsets).any(axis=1).mean())
+    return float(1 - _inside(contour, points).mean())
 
 
 def contact_mm2(organ: trimesh.Trimesh, tumour: trimesh.Trimesh) -> float:
@@ -174,6 +173,15 @@ def touches_main_vessel(tumour: trimesh.Trimesh, vessels: dict[str, Grid]) -> bo
     if gaps and min(gaps) <= TOUCH_MM:
         return True
     return False if "vessel" in vessels or {"artery", "vein"} <= set(vessels) else None
+
+
+def _inside(surface: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+    """Which points (n, 3) are inside a closed surface; faster than their distances."""
+    vertices, faces = (
+        np.ascontiguousarray(surface.vertices, float),
+        np.ascontiguousarray(surface.faces, np.int64),
+    )
+    return igl.fast_winding_number(vertices, faces, points) > 0.5
 
 
 def _places(grid: Grid, indices: np.ndarray) -> np.ndarray:

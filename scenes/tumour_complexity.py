@@ -29,8 +29,9 @@ class Complexity:
     @property
     def not_known(self) -> list[str]:
         """What the labels leave open."""
-        hilar = ["h"] if self.tumour.touches_main_vessel is None else []
-        return [each.name for each in self._components if each.needs] + hilar
+        names = [each.name for each in self._components if each.needs]
+        names += [] if face_of(self.tumour) else ["a/p"]
+        return names + (["h"] if self.tumour.touches_main_vessel is None else [])
 
     @property
     def labels_needed(self) -> list[str]:
