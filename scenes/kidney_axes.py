@@ -96,11 +96,11 @@ def kidney_axes(
 
 
 def _off_lesions(organ: trimesh.Trimesh, lesions: Sequence[trimesh.Trimesh]) -> np.ndarray:
-    """Which vertices (n,) of an organ are not the surface of a lesion; all, where too few are left for a contour."""
+    """Which vertices (n,) of an organ are not the surface of a lesion; all, where the organ is nothing but lesions."""
     own = np.ones(len(organ.vertices), bool)
     for lesion in lesions:
         own &= signed_distance_from(lesion, organ.vertices) > LESION_MM
-    return own if own.mean() > 0.1 else np.ones_like(own)
+    return own if own.mean() > 0.01 else np.ones_like(own)
 
 
 def _sinus_opening(organ: trimesh.Trimesh, parts: dict[str, trimesh.Trimesh], own: np.ndarray) -> np.ndarray:

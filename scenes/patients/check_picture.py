@@ -40,7 +40,7 @@ LEAST_BRIGHT = 0.85
 # Letters in a line of the largest text, its sizes [points], and lines times size that fit above the names of the colours.
 TEXT_WIDTH = 56
 TEXT_POINTS = (8.5, 8.0, 7.5, 7.0, 6.5, 6.0, 5.5, 5.0)
-TEXT_HEIGHT = 195.0
+TEXT_HEIGHT = 188.0
 # White with a black outline, readable on bone and on air.
 LETTER: dict[str, Any] = dict(
     color="white",
