@@ -37,7 +37,7 @@ class Component:
 
 
 @dataclass(frozen=True)
-class Score:
+class NephrometryScore:
     """A score with its components; ``least`` and ``most`` differ where a component is not certain."""
 
     components: tuple[Component, ...]
@@ -67,7 +67,7 @@ class Score:
         return f"{total}{self.suffix}"
 
 
-def renal_score(tumour: TumourAnatomy) -> Score:
+def renal_score(tumour: TumourAnatomy) -> NephrometryScore:
     """R.E.N.A.L. nephrometry score, 4 to 12 points: low to 6, moderate to 9, high from 10.
 
     R: diameter, up to 40 mm 1, below 70 mm 2, else 3. E: exophytic share of the volume, from 50 % 1, below 2, entirely endophytic 3.
@@ -76,7 +76,7 @@ def renal_score(tumour: TumourAnatomy) -> Score:
     tumour touches the main renal artery or vein.
     """
     radius = 1 if tumour.diameter_mm <= 40 else 2 if tumour.diameter_mm < 70 else 3
-    return Score(
+    return NephrometryScore(
         (
             Component("R", (radius,), tumour.diameter_mm, "mm"),
             Component("E", (_exophytic_points(tumour),), tumour.exophytic_share, "share"),
@@ -88,7 +88,7 @@ def renal_score(tumour: TumourAnatomy) -> Score:
     )
 
 
-def padua_score(tumour: TumourAnatomy) -> Score:
+def padua_score(tumour: TumourAnatomy) -> NephrometryScore:
     """PADUA score, 6 to 14 points: low to 7, intermediate to 9, high from 10.
 
     Location: more than half of the volume between the sinus lines 2, else 1. Exophytic rate: as E. Rim: centre of mass on the hilum's
@@ -97,7 +97,7 @@ def padua_score(tumour: TumourAnatomy) -> Score:
     """
     size = 1 if tumour.diameter_mm <= 40 else 2 if tumour.diameter_mm <= 70 else 3
     face = face_of(tumour)
-    return Score(
+    return NephrometryScore(
         (
             _sinus_location(tumour),
             Component("exophytic", (_exophytic_points(tumour),), tumour.exophytic_share, "share"),

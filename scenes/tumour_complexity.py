@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from scenes.anatomy import LoadedAnatomy
-from scenes.nephrometry import Component, Score, face_of, padua_score, renal_score
+from scenes.nephrometry import Component, NephrometryScore, face_of, padua_score, renal_score
 from scenes.scene import Vector3
 from scenes.tumour_anatomy import TumourAnatomy, tumour_anatomy
 
@@ -17,8 +17,8 @@ class Complexity:
     """The measures of a tumour, and the scores that they give."""
 
     tumour: TumourAnatomy
-    renal: Score
-    padua: Score
+    renal: NephrometryScore
+    padua: NephrometryScore
 
     @property
     def estimated(self) -> list[str]:
@@ -90,7 +90,7 @@ def complexity(anatomy: LoadedAnatomy, hilum_mm: Vector3 | None) -> Complexity |
     return Complexity(tumour, renal_score(tumour), padua_score(tumour))
 
 
-def _in_words(score: Score, measures: bool) -> str:
+def _in_words(score: NephrometryScore, measures: bool) -> str:
     return f"{score}, {score.complexity}: " + ", ".join(
         _component(each, measures) for each in score.components
     )
@@ -104,7 +104,7 @@ def _component(each: Component, measures: bool) -> str:
     return f"{each.name} {points} ({measure})"
 
 
-def _figures(score: Score) -> dict[str, Any]:
+def _figures(score: NephrometryScore) -> dict[str, Any]:
     return dict(
         least=score.least,
         most=score.most,
