@@ -94,7 +94,7 @@ class Frames(Generic[Source]):
     def with_resection(self, view: View, settings: Settings) -> View:
         """A view with the score and the coming cut."""
         planned = cut_settings(settings)
-        self.resection.update(planned, self.measurements.coverage.is_seen)
+        self.resection.update(planned, lambda points: self.measurements.coverage.is_seen(points))
         score = self.resection.score(planned.margin_mm)
         if score is None:
             return view

@@ -1,6 +1,7 @@
 """A rehearsal without a screen: the scripted press, or a recorded session."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 from PIL import Image
@@ -17,9 +18,7 @@ from rehearsal.result_files import write_json
 from render.animation import ANIMATION_FPS, empty_folder, save_animation, scaled_down, side_by_side
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan, Window
-from scenes.anatomy import LoadedAnatomy
 from scenes.atomic_files import atomic_write
-from scenes.tumour_complexity import complexity
 
 # An animation is held in memory: a long session has fewer images in it.
 MOST_SHOWN = 240
@@ -69,15 +68,18 @@ class Pictures:
 
 def run_headless(
     frames: Frames,
-    anatomy: LoadedAnatomy,
     notices: Notices,
     steps: int,
     settings: Settings,
     arch: str,
     out: Path,
     draws: bool = True,
+    about: dict[str, Any] | None = None,
 ) -> None:
-    """Compute so many frames; write surfaces and report.json, and where it ``draws``, images too, also for the link."""
+    """Compute so many frames; write surfaces and report.json, and where it ``draws``, images too, also for the link.
+
+    ``about`` is what else the report says, of the patient.
+    """
     rehearsal, tally = frames.rehearsal, frames.tally
     pictures = Pictures(rehearsal, steps, out) if draws else None
     for step in tqdm(range(1, steps + 1), desc="press", unit="step"):
@@ -98,10 +100,7 @@ def run_headless(
         notices.present()
     save_surfaces(rehearsal, out)
     drawn = [pictures.save()] if pictures is not None else []
-    found = complexity(anatomy, rehearsal.scene.attachment.at_mm)
-    report = tally.report(rehearsal, arch) | dict(
-        complexity=None if found is None else found.figures(), reading=frames.measurements.figures()
-    )
+    report = tally.report(rehearsal, arch) | (about or {}) | dict(reading=frames.measurements.figures())
     if rehearsal.judgement is not None:
         from rehearsal.resection.resection_page import report_of
 

@@ -42,6 +42,7 @@ from render.window import Window
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import EMBEDDED
 from scenes.terminal import shell_command
+from scenes.tumour_complexity import complexity
 from version import VERSION
 
 
@@ -127,14 +128,19 @@ class RehearsalRun:
         with self._summarised(source, replay):
             run_headless(
                 frames,
-                self.anatomy,
                 self.notices,
                 steps,
                 settings,
                 self.arch,
                 self.asked.out,
                 not self.asked.no_pictures,
+                self._about_patient(),
             )
+
+    def _about_patient(self) -> dict[str, Any]:
+        """The complexity of the tumour, for the report."""
+        found = complexity(self.anatomy, self.rehearsal.scene.attachment.at_mm)
+        return dict(complexity=None if found is None else found.figures())
 
     def _replayed_steps(self, replay: Replay) -> int:
         steps = len(replay.log.poses) - replay.session.step_index
