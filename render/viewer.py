@@ -104,7 +104,7 @@ class PlanSettings:
 class ResectionSettings:
     """How the next cut is made; its margin is that of the plan."""
 
-    cut_depth_mm: int = _slider(0, "Depth", "mm", 0, 60, RESECTION)
+    cut_depth_mm: int = _slider(0, "Cut", "mm", 0, 60, RESECTION)
     """Below the score; 0: as deep as tumour and margin were seen in the image."""
     air_in_crater: bool = _switch(False, "Air in crater", RESECTION)
     show_resection: bool = False

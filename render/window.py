@@ -159,7 +159,8 @@ class Window:
         if self._drag is not None:
             {"orbit": self.camera.orbit, "pan": self.camera.pan}[self._drag](*self._moved)
         controls.press = self._pressing
-        if self._drag is None and self._over_scene():
+        # With shift the mouse marks the score, and the probe stays where it is.
+        if self._drag is None and self._over_scene() and not self._window.is_pressed(ti.ui.SHIFT):
             controls.ray = self.camera.ray(self._cursor)
         if self._gamepad is not None:
             self._gamepad.read(controls, elapsed)
