@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from errors import UserError
-from rehearsal.resection.script import ScriptedCut, Number, ScriptedAction
+from rehearsal.resection.script import Number, ScriptedAction, ScriptedCut
 from ultrasound.probe_manipulator import interpolated
 
 # Tolerance of orthonormal axes: more than the rounding of six digits in a file or of a float32, less than a scaled matrix.
