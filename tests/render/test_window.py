@@ -27,7 +27,7 @@ SCREEN, WINDOW = "640x480x24", (640, 360)
 PANEL, SCENE = np.s_[70:310, 400:620], np.s_[40:240, 10:360]
 STILL = 0.5
 # Two points on the B-mode image beside the CT.
-MARKS = ((165, 165), (225, 165), (195, 172))
+MARKS = ((200, 130), (290, 130), (245, 165))
 B_MODE_TOP, B_MODE_FOOT = (460, 90), (460, 230)
 
 
