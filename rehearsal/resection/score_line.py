@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import igl
 import numpy as np
-import potpourri3d
 import trimesh
 
 from errors import UserError
@@ -57,6 +56,9 @@ def score_line(organ: trimesh.Trimesh, marks: np.ndarray) -> ScoreLine:
         raise ResectionError(
             f"the score has {len(marks)} marks; expected {LEAST_MARKS} or more around the tumour"
         )
+    # A rehearsal without a score need not wait for its import.
+    import potpourri3d
+
     on_surface, normals = places_on(organ, marks)
     ordered = on_surface[around_middle(on_surface, normals)]
     vertices, faces, corners = with_vertices(organ, ordered)
