@@ -16,7 +16,7 @@ import manifold3d
 import numpy as np
 import trimesh
 
-from rehearsal.resection.score_line import ResectionError, ScoreLine
+from rehearsal.resection.score_line import ResectionError, ScoreLine, places_on
 from render.viewer import Technique
 from scenes.solids import solid_of, surface_of
 from ultrasound.crater import Filling
@@ -76,7 +76,7 @@ def cut_organ(
     cutter = _cutter(organ, line, settings, tumour_points).as_original()
     inner, outer = whole ^ cutter, whole - cutter
     _check_size(inner.volume(), organ.volume)
-    pieces = sorted(inner.decompose(), key=lambda piece: -piece.volume())
+    pieces = sorted(inner.decompose(), key=lambda piece: _distance_mm(piece, line))
     staying_ml = sum(piece.volume() for piece in pieces[1:]) / 1000
     warnings = []
     if staying_ml > LEAST_STAYING_ML:
@@ -94,6 +94,12 @@ def cut_organ(
     rest, of_rest = surface_of(remnant)
     capsule = whole.original_id()
     return Cut(line, settings, own, rest, of_own != capsule, of_rest != capsule, tuple(warnings))
+
+
+def _distance_mm(piece: manifold3d.Manifold, line: ScoreLine) -> float:
+    """Mean distance [mm] of a line's points from a solid's surface."""
+    near = places_on(surface_of(piece)[0], line.points)[0]
+    return float(np.linalg.norm(near - line.points, axis=1).mean())
 
 
 def _check_size(volume_mm3: float, organ_mm3: float) -> None:
