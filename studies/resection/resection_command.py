@@ -71,9 +71,9 @@ Part = tuple[str, dict[str, Any]]
     "--seed", type=WholeRange(0, 10**9), default=0, show_default=True, help="That of the first random score."
 )
 def resection(patients: tuple[Path, ...], out: Path, chosen: tuple[str, ...], cuts: int, seed: int) -> None:
-    """Measure the resection: margins, balance, random cuts, times.
+    """Measure margins, balance, random cuts and times of the resection.
 
-    Of the embedded patient, and of further patients' folders. The finite elements of the balance take three quarters of an hour the first time.
+    Of the embedded patient, and of further patients' folders. The finite elements of the balance take ten minutes the first time.
     """
     make_folder(out)
     loaded: list[Patient] = [(folder.name, *load_patient(folder)) for folder in (EMBEDDED, *patients)]

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from rehearsal.resection.cut import Cut
 from rehearsal.resection.judgement import NOT_PARENCHYMA
-from studies.resection.voxel_solid import VoxelGrid
+from studies.resection.voxel_solid import RasterGrid
 
 VOXEL_MM = 0.3
 # Normals are those of the solid, smoothed with this standard deviation.
@@ -40,7 +40,7 @@ def figures_by_voxels(
 
     The resection surface is where a voxel of the specimen has a neighbour that is of the organ and not of the specimen.
     """
-    grid = VoxelGrid.around([cut.specimen, tumour], VOXEL_MM, AROUND_MM)
+    grid = RasterGrid.around([cut.specimen, tumour], VOXEL_MM, AROUND_MM)
     specimen, whole, growth = (grid.inside(each) for each in (cut.specimen, organ, tumour))
     healthy = whole & ~growth
     for name in NOT_PARENCHYMA:

@@ -7,7 +7,7 @@ import trimesh
 
 
 @dataclass(frozen=True)
-class VoxelGrid:
+class RasterGrid:
     """Voxels of one width [mm]; ``low_mm`` (3,) is the centre of the first, ``count`` (3,) their number along x, y, z."""
 
     low_mm: np.ndarray
@@ -15,7 +15,7 @@ class VoxelGrid:
     voxel_mm: float
 
     @classmethod
-    def around(cls, surfaces: list[trimesh.Trimesh], voxel_mm: float, margin_mm: float) -> "VoxelGrid":
+    def around(cls, surfaces: list[trimesh.Trimesh], voxel_mm: float, margin_mm: float) -> "RasterGrid":
         """A grid around surfaces and a margin."""
         low = np.min([each.bounds[0] for each in surfaces], axis=0) - margin_mm
         high = np.max([each.bounds[1] for each in surfaces], axis=0) + margin_mm

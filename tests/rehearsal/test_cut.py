@@ -213,3 +213,12 @@ def test_a_part_loses_what_is_in_the_specimen():
     assert part_outside(ball(2.0, (0.0, 0.0, HEIGHT_MM)), made) is None
     away = ball(4.0, (0.0, 0.0, -15.0))
     assert part_outside(away, made).volume == pytest.approx(away.volume, rel=1e-9)
+
+
+def test_a_piece_next_to_nothing_that_rounding_leaves_is_in_neither():
+    """Beside the organ, above the score: too small to be a piece, so that it neither stays nor comes with the specimen."""
+    crumb = trimesh.creation.icosahedron().apply_scale(0.002).apply_translation([0.0, 0.0, R + 2.0])
+    organ = trimesh.util.concatenate([ORGAN, crumb])
+    made = cut_organ(organ, LINE, CutSettings("wedge", depth_mm=12.0), np.zeros((0, 3)))
+    assert made.specimen.body_count == 1 and made.remnant.body_count == 1
+    assert made.specimen.bounds[1, 2] < R + 1.0
