@@ -76,7 +76,8 @@ def resection(patients: tuple[Path, ...], out: Path, chosen: tuple[str, ...], cu
     Of the embedded patient, and of further patients' folders. The finite elements of the balance take ten minutes the first time.
     """
     make_folder(out)
-    loaded: list[Patient] = [(folder.name, *load_patient(folder)) for folder in (EMBEDDED, *patients)]
+    loaded: list[Patient] = [("embedded", *load_patient(EMBEDDED))]
+    loaded += [(folder.name, *load_patient(folder)) for folder in patients]
     parts: dict[str, Callable[[], Part]] = dict(
         margins=lambda: _margins(loaded),
         balance=_balance,
