@@ -40,7 +40,10 @@ COMMANDS = {
         "scenes.patients.import_command:import_patient_command",
         "Make a patient's folder from a CT and its LABELS.",
     ),
-    "plan": ("rehearsal.commands.plan_command:plan", "Plan a sweep over SCENE that covers the target."),
+    "plan": (
+        "rehearsal.commands.plan_command:plan",
+        "Plan a sweep over SCENE that covers the target, or a resection.",
+    ),
     "export": (
         "rehearsal.commands.export_command:export",
         "Write surfaces, CT and labels of SCENE as files.",

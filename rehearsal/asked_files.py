@@ -13,6 +13,12 @@ from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.configuration import probe_of, with_quality
 from rehearsal.measurements.uncertainty_bands import UncertaintyBands, UncertaintyError, read_bands
 from rehearsal.planning.plan_file import Plan, PlanError, is_plan, read_plan
+from rehearsal.resection.resection_plan import (
+    ResectionPlan,
+    ResectionPlanError,
+    is_resection_plan,
+    read_resection_plan,
+)
 from rehearsal.sessions.session_file import Log, SessionError, read_log, scene_of_log
 from rehearsal.tracking.pose_file import TimedPoses
 from rehearsal.tracking.track_file import check_near, load_track
@@ -32,6 +38,7 @@ class AskedFiles:
     keys: Keys
     track: TimedPoses | None = None
     plan: Plan | None = None
+    resection_plan: ResectionPlan | None = None
     log: Log | None = None
     bands: UncertaintyBands | None = None
 
@@ -43,11 +50,15 @@ def read_files(asked: RehearseOptions) -> AskedFiles:
     keys = load_keys(asked.keys) if asked.keys else Keys()
     asked.check()
     track = load_track(asked.track, asked.track_from) if asked.track else None
-    plan = read_plan(asked.plan) if asked.plan else None
+    plan = resection_plan = None
+    if asked.plan is not None and is_resection_plan(asked.plan):
+        resection_plan = read_resection_plan(asked.plan)
+    elif asked.plan is not None:
+        plan = read_plan(asked.plan)
     log = session_of(asked.replay, asked.at) if asked.replay else None
     changed, probe = as_asked(scene, asked) if log is None else as_recorded(log, scene)
     bands = None if scene.uncertainty is None else read_bands(path.parent / scene.uncertainty)
-    return AskedFiles(path.parent, changed, probe, keys, track, plan, log, bands)
+    return AskedFiles(path.parent, changed, probe, keys, track, plan, resection_plan, log, bands)
 
 
 def check_anatomy(files: AskedFiles, asked: RehearseOptions, anatomy: LoadedAnatomy) -> None:
@@ -67,6 +78,11 @@ def check_anatomy(files: AskedFiles, asked: RehearseOptions, anatomy: LoadedAnat
         check_near(files.track, anatomy.organ.vertices, asked.track)
         if is_plan(asked.track):
             check_plan(read_plan(asked.track), fingerprint(anatomy), files.probe)
+    if files.resection_plan is not None and files.resection_plan.anatomy != fingerprint(anatomy):
+        raise ResectionPlanError(
+            "the plan of the resection is for other anatomy than this scene: name its scene or patient's folder before --plan; a patient "
+            "imported again counts as another"
+        )
     if files.plan is not None:
         check_plan(files.plan, fingerprint(anatomy), files.probe)
 

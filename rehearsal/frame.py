@@ -20,12 +20,15 @@ from rehearsal.inputs.user_input import UserInput
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally
 from rehearsal.notices import Notices
-from rehearsal.open_window import probe_with_settings
+from rehearsal.open_window import geometry_of, probe_with_settings
 from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.pressed_organ import Step
 from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.real_time.solver_process import SolverProcess
 from rehearsal.rehearsal import Rehearsal
+from rehearsal.resection.cut import Cut
+from rehearsal.resection.resection_plan import ResectionPlan
+from rehearsal.resection.resection_view import ResectionView, cut_settings
 from rehearsal.stopwatch import timed
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer, send_live
 from rehearsal.tracking.sweep_recording import SweepRecorder
@@ -60,6 +63,11 @@ class Frames(Generic[Source]):
     measurements: LiveMeasurements
     tally: Tally
     link: OpenIGTLinkServer | None = None
+    resection_plan: ResectionPlan | None = None
+    resection: ResectionView = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.resection = ResectionView(self.rehearsal, self.resection_plan)
 
     def input(self, controls: Controls) -> np.ndarray | None:
         """Return the transducer's next pose (4, 4); None if this frame makes no step."""
@@ -79,7 +87,21 @@ class Frames(Generic[Source]):
 
     def image(self, probe: Probe, settings: Settings) -> View:
         """Compute the images of the probe at its present pose."""
-        return image_view(self.rehearsal, probe, settings, self.tally, None, self.source.session.time_s)
+        time_s = self.source.session.time_s
+        view = image_view(self.rehearsal, probe, settings, self.tally, None, time_s)
+        return self.with_resection(view, settings)
+
+    def with_resection(self, view: View, settings: Settings) -> View:
+        """A view with the score and the coming cut."""
+        planned = cut_settings(settings)
+        self.resection.update(planned, lambda points: self.measurements.coverage.is_seen(points))
+        score = self.resection.score(planned.margin_mm)
+        if score is None:
+            return view
+        plane = self.rehearsal.image_plane()
+        return replace(
+            view, score=score, resection_mm=self.resection.section(np.linalg.inv(plane.world_from_plane))
+        )
 
     def observe(self, probe: Probe, pose: np.ndarray | None) -> None:
         """Measure, and record the session; no pose is a rollback."""
@@ -122,8 +144,10 @@ class WindowFrames(Frames[WindowInput]):
     _notice: str = field(default="", init=False)
     _notice_until: float = field(default=0.0, init=False)
     _restored_until: float = field(default=0.0, init=False)
+    _shown_cut: Cut | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self.solver.on_step = self.take
         self._rollbacks = self.source.session.rollbacks
 
@@ -149,6 +173,9 @@ class WindowFrames(Frames[WindowInput]):
         with self.times.stage("state"):
             self.solver.collect()
             self.rehearsal.update_surfaces()
+        if self.rehearsal.cut is not self._shown_cut:
+            self._shown_cut = self.rehearsal.cut
+            self.viewer.change_geometry(geometry_of(self.rehearsal))
         self._shown_input_s = None if self.frozen or self._last_step is None else self._last_step.input_s
         probe = probe_with_settings(self.rehearsal.probe, controls.settings)
         with self.times.stage("image"):
@@ -187,7 +214,9 @@ class WindowFrames(Frames[WindowInput]):
 
     def drive(self, controls: Controls) -> None:
         """Apply the keys of freeze, cine and plans; then tell the solver what to do, unless frozen."""
-        ends_freeze = (controls.reset, controls.undo, controls.redo, controls.bookmark, controls.to_bookmark)
+        restores = (controls.reset, controls.undo, controls.redo, controls.bookmark, controls.to_bookmark)
+        operates = (controls.score_image, controls.score_under is not None, controls.cut_out)
+        ends_freeze = (*restores, *operates)
         if any(ends_freeze):
             # They change the state, whose image counts for the coverage.
             self._observe_last()
@@ -250,7 +279,7 @@ class WindowFrames(Frames[WindowInput]):
     def present(self, view: View, probe: Probe, controls: Controls) -> View:
         """Add measurements, caliper and status to the view."""
         shown = self.cine.shown if self._shows_earlier else self._measured(view, probe, controls.settings)
-        view = shown.view
+        view = self.with_resection(shown.view, controls.settings)
         self.caliper.point(controls.pointed_mm, view.transducer_pose)
         if not self.frozen:
             self.caliper.go_with(view.transducer_pose)
@@ -262,7 +291,7 @@ class WindowFrames(Frames[WindowInput]):
             readouts=view.readouts | self._speeds(),
             clock=f"{self.source.session.time_s:.1f} s",
             pace=self._pace(),
-            status=self._status(view),
+            status=self._status(view, controls.settings),
             notes={name: self._with_hint(note) for name, note in view.notes.items()},
         )
 
@@ -307,12 +336,13 @@ class WindowFrames(Frames[WindowInput]):
             return note
         return self.keys.worded(f"{note}\n{HOW_TO_PRESS}")
 
-    def _status(self, view: View) -> str:
+    def _status(self, view: View, settings: Settings) -> str:
         """The text over the images, the most important first: text that does not fit is cut at the end."""
         now = perf_counter()
         restored = "STATE RESTORED" if now < self._restored_until else ""
         news = [self._notice] if now < self._notice_until else [self._state(), self.plans.status]
-        parts = [restored, view.status, self.sweeping.status, *news]
+        score = self.resection.status(cut_settings(settings))
+        parts = [restored, view.status, self.sweeping.status, *news, score]
         return self.keys.worded("   ".join(filter(None, parts)))
 
     def _state(self) -> str:

@@ -1,6 +1,7 @@
 """A rehearsal without a screen: the scripted press, or a recorded session."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 from PIL import Image
@@ -11,7 +12,7 @@ from rehearsal.image_and_surface_files import save_image_file, save_surfaces
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import summary
 from rehearsal.notices import Notices
-from rehearsal.open_window import open_viewer, probe_with_settings
+from rehearsal.open_window import geometry_of, open_viewer, probe_with_settings
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import write_json
 from render.animation import ANIMATION_FPS, empty_folder, save_animation, scaled_down, side_by_side
@@ -28,6 +29,7 @@ class Pictures:
 
     def __init__(self, rehearsal: Rehearsal, steps: int, out: Path) -> None:
         self.steps, self.out = steps, out
+        self._rehearsal, self._shown_cut = rehearsal, rehearsal.cut
         self.viewer: Window | None = None
         try:
             self.viewer = open_viewer(rehearsal, visible=False)
@@ -48,6 +50,9 @@ class Pictures:
         picture = side_by_side(view)
         save_image_file(picture, self._slices / f"{step:05d}.png")
         if self.viewer is not None:
+            if self._rehearsal.cut is not self._shown_cut:
+                self._shown_cut = self._rehearsal.cut
+                self.viewer.change_geometry(geometry_of(self._rehearsal))
             self.viewer.draw(measurements.onto(view, settings))
             picture = Image.fromarray(self.viewer.picture())
             save_image_file(picture, self._frames / f"{step:05d}.png")
@@ -69,8 +74,12 @@ def run_headless(
     arch: str,
     out: Path,
     draws: bool = True,
+    about: dict[str, Any] | None = None,
 ) -> None:
-    """Compute so many frames; write surfaces and report.json, and where it ``draws``, images too, also for the link."""
+    """Compute so many frames; write surfaces and report.json, and where it ``draws``, images too, also for the link.
+
+    ``about`` is what else the report says, of the patient.
+    """
     rehearsal, tally = frames.rehearsal, frames.tally
     pictures = Pictures(rehearsal, steps, out) if draws else None
     for step in tqdm(range(1, steps + 1), desc="press", unit="step"):
@@ -91,9 +100,11 @@ def run_headless(
         notices.present()
     save_surfaces(rehearsal, out)
     drawn = [pictures.save()] if pictures is not None else []
-    report = tally.report(rehearsal, arch) | dict(reading=frames.measurements.figures())
+    report = tally.report(rehearsal, arch) | (about or {}) | dict(reading=frames.measurements.figures())
     if rehearsal.judgement is not None:
-        report |= dict(resection=rehearsal.judgement.report())
+        from rehearsal.resection.resection_page import report_of
+
+        report |= dict(resection=report_of(rehearsal, frames.resection_plan))
     write_json(report, out / "report.json")
     click.echo(summary(report))
     click.echo(f"Wrote {' and '.join([*drawn, 'report.json'])} to {out}")

@@ -10,6 +10,7 @@ import trimesh
 from PIL import Image
 
 from rehearsal.rehearsal import Rehearsal
+from rehearsal.resection.score_file import save_score
 from rehearsal.result_files import next_number
 from render.animation import with_square_pixels
 from render.viewer import View
@@ -80,10 +81,19 @@ def save_view(view: View, probe: Probe, out: Path) -> str:
 
 
 def save_surfaces(rehearsal: Rehearsal, out: Path, prefix: str = "") -> None:
-    """Write organ and tumour in their deformed state (PLY, mm, LPS), and print the paths; vertices are in the order of the rest surfaces."""
+    """Write organ, tumour, and a specimen as it was cut (PLY, mm, LPS), and the score in the CT, and print the paths.
+
+    Vertices are in the order of the rest surfaces.
+    """
     deformed = {"organ": (rehearsal.organ, array_of(rehearsal.organ_skin.vertices))}
     if rehearsal.tumour is not None:
         deformed["tumour"] = rehearsal.tumour, rehearsal.tumour_vertices()
+    if rehearsal.cut is not None:
+        specimen = rehearsal.cut.specimen
+        deformed["specimen"] = specimen, rehearsal.carried_then(specimen.vertices)
+    score = save_score(rehearsal, out, prefix)
+    if score is not None:
+        click.echo(f"Saved {score}")
     for name, (rest, vertices) in deformed.items():
         path = out / f"{prefix}{name}.ply"
         save_surface(trimesh.Trimesh(vertices + rehearsal.origin, rest.faces, process=False), path)

@@ -82,9 +82,15 @@ def geometry_of(rehearsal: Rehearsal) -> Geometry:
     if rehearsal.supports:
         fixed = rehearsal.supports[0]
         support = np.asarray(fixed.vertices, np.float32), np.asarray(fixed.faces, np.int32)
+    specimen = None
+    if rehearsal.cut is not None:
+        specimen = (
+            rehearsal.specimen_beside().astype(np.float32),
+            np.asarray(rehearsal.cut.specimen.faces, np.int32),
+        )
     return Geometry(
         organ=(rehearsal.organ_skin.vertices, np.asarray(rehearsal.organ.faces, np.int32)),
-        bounds=rehearsal.organ.bounds,
+        bounds=rehearsal.whole_organ.bounds,
         up=-rehearsal.gravity_direction,
         transducer_size_mm=rehearsal.size_mm,
         transducer_radius_mm=rehearsal.probe.radius_mm,
@@ -95,4 +101,5 @@ def geometry_of(rehearsal: Rehearsal) -> Geometry:
             for tissue, skin in rehearsal.part_skins.items()
         },
         support=support,
+        specimen=specimen,
     )

@@ -12,13 +12,13 @@ import trimesh
 
 from rehearsal.build_solver import embedding_cell_mm
 from rehearsal.pressed_organ import OrganState, PressedOrgan
-from rehearsal.resection.cut import Cut, cut_organ, part_outside
+from rehearsal.resection.cut import Cut, cut_organ, part_left
 from rehearsal.resection.judgement import Carried, Judgement, judge
 from rehearsal.resection.resection_state import NO_RESECTION, Resection
 from rehearsal.resection.score_line import LEAST_MARKS, ResectionError, ScoreLine, score_line
 from scenes.anatomy import Grid, LoadedAnatomy
 from scenes.scene import Scene
-from scenes.surfaces import translated, volume_mm3
+from scenes.surfaces import signed_distance_from, translated, volume_mm3
 from scenes.terminal import ReportProgress, no_progress
 from sim.embedding import Embedding
 from sim.fields import array_of
@@ -43,6 +43,8 @@ SUPPORT_SUNK_MM = 0.4
 SURROUNDINGS_MM = 25.0
 # Points along each side of an image whose rest positions are computed.
 REST_PLACES = 48
+# Gap between the organ and the specimen beside it.
+BESIDE_MM = 8.0
 # Cuts of this many states are kept, for undo and redo.
 KEPT_CUTS = 4
 
@@ -108,10 +110,10 @@ class Rehearsal(PressedOrgan):
 
     def _build_surfaces(self) -> None:
         """The surfaces that move with the tissue: of the whole organ and its parts, or of what remains of them after a cut."""
-        self.tumour = self.whole_tumour and part_outside(self.whole_tumour, self.cut)
+        self.tumour = self.whole_tumour and part_left(self.whole_tumour, self.cut, is_within=True)
         # The sinus surrounds the other parts, and would hide them.
         parts = {tissue: part for tissue, part in self.whole_parts.items() if tissue != "sinus"}
-        remains = {tissue: part_outside(part, self.cut) for tissue, part in parts.items()}
+        remains = {tissue: part_left(part, self.cut) for tissue, part in parts.items()}
         self.parts = {tissue: part for tissue, part in remains.items() if part is not None}
         self.organ_skin = Skin(self.model, self.organ.vertices)
         self.tumour_skin = self._tumour_border = None
@@ -217,8 +219,17 @@ class Rehearsal(PressedOrgan):
             tumour = np.zeros((0, 3)) if self.whole_tumour is None else np.asarray(self.whole_tumour.vertices)
             seen = tumour[resection.cut.seen_of(len(tumour))]
             made = cut_organ(self.whole_organ, line, resection.cut.settings, seen)
+            self._check_hilum(made)
             self._cuts = dict([*self._cuts.items(), (resection, made)][-KEPT_CUTS:])
         return self._cuts[resection]
+
+    def _check_hilum(self, cut: Cut) -> None:
+        """Raises ResectionError where the specimen would contain the hilum."""
+        hilum = self.scene.attachment.at_mm
+        if hilum is not None and signed_distance_from(cut.specimen, np.array([hilum]) - self.origin)[0] < 0:
+            raise ResectionError(
+                "the cut goes through the hilum, with the kidney's vessels; set the score nearer to the tumour"
+            )
 
     def apply_cut(self, cut: Cut | None) -> None:
         super().apply_cut(cut)
@@ -237,6 +248,17 @@ class Rehearsal(PressedOrgan):
         return self.model.whole_lattice.carried(  # type: ignore[attr-defined]
             np.asarray(points, float), request.nodes_mm
         )
+
+    def specimen_beside(self) -> np.ndarray:
+        """Vertices (n, 3) [mm] of the specimen as it was cut, beside the end of the organ that is nearer to it. Raises ResectionError."""
+        if self.cut is None:
+            raise ResectionError("nothing was cut yet")
+        vertices = self.carried_then(self.cut.specimen.vertices)
+        long_axis = np.array(self.press.lateral)
+        organ, own = np.asarray(self.whole_organ.vertices) @ long_axis, vertices @ long_axis
+        side = 1.0 if own.mean() >= organ.mean() else -1.0
+        reach = (side * organ).max() - (side * own).min()
+        return vertices + side * (reach + BESIDE_MM) * long_axis
 
     @property
     def judgement(self) -> Judgement | None:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import click
 import numpy as np
@@ -41,6 +42,7 @@ from render.window import Window
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import EMBEDDED
 from scenes.terminal import shell_command
+from scenes.tumour_complexity import complexity
 from version import VERSION
 
 
@@ -93,6 +95,7 @@ class RehearsalRun:
             sweeping=SweepRecorder(self.rehearsal, self.notices),
             plans=PlanControl(self.rehearsal, self.anatomy, self.measurements, self.asked.out, self.notices),
             keys=self.files.keys,
+            resection_plan=self.files.resection_plan,
         )
         prepare(frames)
         try:
@@ -114,11 +117,30 @@ class RehearsalRun:
             source, steps = self._tracked_input(self.files.track)
         else:
             source, steps = self._scripted_input()
-        frames = Frames(self.rehearsal, source, self.measurements, Tally(self.build_s), self.link)
+        frames = Frames(
+            self.rehearsal,
+            source,
+            self.measurements,
+            Tally(self.build_s),
+            self.link,
+            self.files.resection_plan,
+        )
         with self._summarised(source, replay):
             run_headless(
-                frames, self.notices, steps, settings, self.arch, self.asked.out, not self.asked.no_pictures
+                frames,
+                self.notices,
+                steps,
+                settings,
+                self.arch,
+                self.asked.out,
+                not self.asked.no_pictures,
+                self._about_patient(),
             )
+
+    def _about_patient(self) -> dict[str, Any]:
+        """The complexity of the tumour, for the report."""
+        found = complexity(self.anatomy, self.rehearsal.scene.attachment.at_mm)
+        return dict(complexity=None if found is None else found.figures())
 
     def _replayed_steps(self, replay: Replay) -> int:
         steps = len(replay.log.poses) - replay.session.step_index
@@ -193,9 +215,24 @@ class RehearsalRun:
             self._end(source.bookmarks)
             _echo(_verdict(replay))
 
+    def _judged(self) -> dict[str, Any]:
+        """Write the page of the resection and print its figures; return them."""
+        # Matplotlib takes half a second to import.
+        from rehearsal.resection.resection_page import report_of, rows_of, save_page
+
+        report = report_of(self.rehearsal, self.files.resection_plan)
+        click.echo("\n".join(f"{name:<20}  {value}" for name, value in rows_of(report)))
+        try:
+            click.echo("Saved " + " and ".join(map(str, save_page(self.rehearsal, report, self.asked.out))))
+        except OSError as error:
+            click.echo(f"Warning: the page of the resection is not saved: {error.strerror}")
+        return report
+
     def _end(self, bookmarks: int) -> None:
         summary = self.measurements.summary(bookmarks)
         click.echo(summary_text(summary))
+        if self.rehearsal.judgement is not None:
+            summary |= dict(resection=self._judged())
         guide = self.measurements.guide
         if guide is not None:
             _echo(guide.in_words(summary.get(f"seen_{guide.plan.target}")))

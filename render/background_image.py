@@ -21,6 +21,7 @@ from render.ultrasound_panel import (
     OUTLINE,
     OUTLINE_AT_REST,
     QUIET,
+    RESECTION_LINE,
     TEXT,
     draw_caliper,
     draw_note,
@@ -139,6 +140,8 @@ class BackgroundImage:
             draw_segments(self._rows, view, box, view.outline_before_mm, OUTLINE_AT_REST)
         if view.outline_mm is not None:
             draw_segments(self._rows, view, box, view.outline_mm, OUTLINE)
+        if view.resection_mm is not None:
+            draw_segments(self._rows, view, box, view.resection_mm, RESECTION_LINE)
         if note := view.notes.get(name):
             draw_note(self._rows, self.layout, box, note)
         draw_caliper(self._rows, view, box, self.layout.px(FIGURE_PX))

@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from errors import UserError, explained, meant
-from render.viewer import Controls
+from render.viewer import TECHNIQUES, Controls
 from ultrasound.probe import DETAIL_LEVELS, DOPPLER_MODES, MODES
 from ultrasound.target import TARGETS
 
@@ -18,6 +18,9 @@ from ultrasound.target import TARGETS
 KEYS = {each: each.lower() for each in string.ascii_uppercase}
 KEYS |= {each: each for each in ("Up", "Down", "Left", "Right", "Return")}
 KEYS |= {"Esc": "Escape", "Space": " ", "Backspace": "BackSpace", "Tab": "Tab"}
+# With the shift key held; as GGUI names them, after this word.
+WITH_SHIFT = "Shift+"
+KEYS |= {WITH_SHIFT + each: WITH_SHIFT + name for each, name in KEYS.items()}
 # In the order of SDL's game controllers.
 BUTTONS = (
     *("A", "B", "X", "Y", "Back", "Guide", "Start", "Left stick", "Right stick"),
@@ -52,13 +55,20 @@ KEY_MAP = {
         "while frozen: cine of the last ten seconds": {"cine_back": "Left", "cine_forth": "Right"},
         "save the image (PNG, DICOM) and the organ (PLY)": {"export": "I"},
     },
+    "Resection": {
+        "score: a mark on the organ": {"score_under": "Shift+Left button"},
+        "score: marks beside the tumour's edges in the image": {"score_image": "Shift+M"},
+        "technique: enucleoresection, wedge, enucleation": {"technique": "Shift+T"},
+        "depth of the cut; air or fluid in the crater": {"show_resection": "Shift+G"},
+        "cut along the score": {"cut_out": "Shift+X"},
+    },
     "Plan": {
         "target: tumour and margin, tumour, kidney": {"plan_for": "Space"},
         "plan a sweep of the target": {"plan": "Return"},
         "stop planning; or show the next sweep, then none": {"next_plan": "Backspace"},
     },
     "Session": {
-        "undo the last press, turn or path; redo it": {"undo": "U", "redo": "Y"},
+        "undo the last press, turn, path, mark or cut; redo it": {"undo": "U", "redo": "Y"},
         "set a bookmark; return to bookmarks": {"bookmark": "M", "to_bookmark": "J"},
         "start and stop recording a tracked sweep": {"sweep": "L"},
         "take control from a replay or a tracked probe": {"take_over": "K"},
@@ -98,13 +108,19 @@ HELD = {
 # The others act when the key goes down: cine steps, settings of several values, settings that are on or off, and controls with the
 # name of the action.
 STEPS = {"cine_back": -1, "cine_forth": 1}
-CYCLES = {"mode": MODES, "detail_level": DETAIL_LEVELS, "doppler": DOPPLER_MODES, "plan_for": TARGETS}
+CYCLES = {
+    "mode": MODES,
+    "detail_level": DETAIL_LEVELS,
+    "doppler": DOPPLER_MODES,
+    "plan_for": TARGETS,
+    "technique": TECHNIQUES,
+}
 # Actions of the 3D view itself.
 VIEW_ACTIONS = ("zoom_in", "zoom_out")
 
 SECTIONS = "unknown key; expected the sections [keys] and [gamepad]"
 HEAD = """# The keys of Nephron's window: change some, leave out the rest, and give the file to rehearse --keys.
-# A key is a letter, where a US keyboard has it, or {named}.
+# A key is a letter, where a US keyboard has it, or {named}; or one of these with Shift, such as Shift+M.
 # A gamepad's button is {buttons}.
 """
 
@@ -127,9 +143,11 @@ class Keys:
     of: Mapping[str, str] = field(default_factory=lambda: DEFAULT_KEYS)
     buttons: Mapping[str, str] = field(default_factory=lambda: DEFAULT_BUTTONS)
 
-    def action_of(self, pressed: str) -> str:
-        """Return the action of a key, as GGUI names it; empty where it has none."""
-        return next((action for action, key in self.of.items() if KEYS[key] == pressed), "")
+    def action_of(self, pressed: str, with_shift: bool = False) -> str:
+        """Return the action of a key, as GGUI names it; empty where it has none. A key that has none with shift has its usual one."""
+        names = (WITH_SHIFT + pressed, pressed) if with_shift else (pressed,)
+        of = {KEYS[key]: action for action, key in self.of.items()}
+        return next((of[name] for name in names if name in of), "")
 
     def held(self) -> list[tuple[str, str]]:
         """Return the actions of held keys, each with its key as GGUI names it."""
@@ -173,7 +191,7 @@ def load_keys(path: Path) -> Keys:
 
 def keys_text() -> str:
     """Return the default keys as the TOML file that ``load_keys`` reads."""
-    named = ", ".join(key for key in KEYS if len(key) > 1)
+    named = ", ".join(key for key in KEYS if len(key) > 1 and not key.startswith(WITH_SHIFT))
     head = HEAD.format(named=named, buttons=", ".join(BUTTONS))
     rows = []
     for group, lines in KEY_MAP.items():

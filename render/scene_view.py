@@ -12,7 +12,7 @@ from render import transducer_shape
 from render.camera import OrbitCamera
 from render.cut_face import CutFace, side_of_eye
 from render.surface_shading import CUT_EDGE_MM, GLASS, SOLID, Cut, DrawnMesh, ShadedSurface
-from render.viewer import Geometry, Guidance, Settings, View
+from render.viewer import Geometry, Guidance, Score, Settings, View
 from sim.fields import field_of, fill
 
 PLANE_ROWS, PLANE_COLUMNS = 96, 64
@@ -26,6 +26,10 @@ MAX_SEGMENTS = 2000
 TO_GO, DONE = np.array([1.0, 0.72, 0.20], np.float32), np.array([0.30, 0.75, 0.42], np.float32)
 GOAL = (1.0, 0.86, 0.45)
 PLAN_WIDTH, GOAL_WIDTH = 2.6, 1.8
+SPECIMEN = (0.72, 0.45, 0.38)
+# The score: a line over the capsule, red where it is too near to the tumour, and its marks as small crosses.
+SCORED, NEAR = np.array([0.35, 0.75, 1.0], np.float32), np.array([1.0, 0.25, 0.2], np.float32)
+MAX_SCORE, MAX_MARKS, MARK_MM, SCORE_LIFT_MM, SCORE_WIDTH = 600, 200, 1.2, 0.6, 3.0
 
 
 class SceneView:
@@ -38,6 +42,10 @@ class SceneView:
         self._parts = [ShadedSurface(*part, PARTS[tissue]) for tissue, part in geometry.parts.items()]
         if geometry.tumour is not None:
             self._tumour = ShadedSurface(*geometry.tumour, TUMOUR)
+        self._specimen = None
+        if geometry.specimen is not None:
+            vertices, faces = geometry.specimen
+            self._specimen = ShadedSurface(field_of(vertices, within=1), faces, SPECIMEN)
         if geometry.support is not None:
             self._support = self._matt_support(*geometry.support)
         self._half_axis_mm = geometry.transducer_size_mm[2] / 2
@@ -47,6 +55,7 @@ class SceneView:
         self._probe_edges = transducer_shape.edges(*shape)
         self._edge_points = field_of(self._probe_edges, within=1)
         self._plan: PlanLines | None = None
+        self._score: ScoreLines | None = None
         self._cut_face: CutFace | None = None
         self._cut_side = 0.0
         self._plane = transducer_shape.image_plane_grid(PLANE_ROWS, PLANE_COLUMNS)
@@ -80,6 +89,9 @@ class SceneView:
         if self._support is not None and settings.show_support:
             # A decimated mesh has slivers that face the wrong way, which would appear as black specks.
             self._support.draw(scene, two_sided=True)
+        if self._specimen is not None:
+            self._specimen.shade(eye, key)
+            self._specimen.draw(scene)
         self._draw_transducer(scene, view.transducer_pose)
         inner = self._inner(view, settings)
         cut = self._draw_cut_face(scene, view, inner, eye, key) if settings.cut else None
@@ -92,6 +104,9 @@ class SceneView:
         if view.guidance is not None:
             self._plan = self._plan or PlanLines(self._probe_edges)
             self._plan.draw(scene, view.guidance)
+        if view.score is not None:
+            self._score = self._score or ScoreLines()
+            self._score.draw(scene, view.score, toward=-ahead)
         opacity = GLASS if settings.translucent else SOLID
         self._organ.tint(view.seen.get("organ"))
         self._organ.shade(eye, key, opacity, cut)
@@ -188,3 +203,46 @@ class PlanLines:
         points[: 2 * len(segments)] = segments.reshape(-1, 3)
         colours[: 2 * len(segments)] = np.where(np.repeat(done, 2)[:, None], DONE, TO_GO)
         fill((self._path, points), (self._colours, colours))
+
+
+class ScoreLines:
+    """The closed line of the score and its marks; of a line of more than MAX_SCORE points only every n-th is drawn."""
+
+    def __init__(self) -> None:
+        self._points, self._colours = (
+            ti.Vector.field(3, ti.f32, 4 * (MAX_SCORE + MAX_MARKS)) for _ in range(2)
+        )
+
+    def draw(self, scene, score: Score, toward: np.ndarray) -> None:
+        """Draw the lines into a scene, lifted a little off the surface, ``toward`` (3,) the eye."""
+        line, near = thinned(score.line_mm), thinned(score.is_near)
+        across = np.linalg.svd(toward[None])[2][1:]
+        crosses = score.marks_mm[:, None, None] + MARK_MM * np.stack([across, -across], axis=1)
+        planned = closed(thinned(score.planned_mm))
+        drawn = (
+            (planned, np.tile(TO_GO, (len(planned), 1))),
+            (closed(line), np.where(near[:, None], NEAR, SCORED)),
+            (crosses.reshape(-1, 2, 3), np.tile(SCORED, (2 * len(crosses), 1))),
+        )
+        segments, colours = (np.concatenate([each[k] for each in drawn]) for k in range(2))
+        segments = segments + SCORE_LIFT_MM * toward
+        if len(segments) == 0:
+            return
+        count = 2 * len(segments)
+        # Unused segments have no length.
+        points = np.repeat(segments[-1:, 1], self._points.shape[0], axis=0).astype(np.float32)
+        points[:count] = segments.reshape(-1, 3)
+        shades = np.tile(SCORED, (len(points), 1))
+        shades[:count] = np.repeat(colours, 2, axis=0)
+        fill((self._points, points), (self._colours, shades))
+        scene.lines(self._points, SCORE_WIDTH, per_vertex_color=self._colours)
+
+
+def thinned(line: np.ndarray) -> np.ndarray:
+    """Every n-th point of a line (k, ...), so that there are no more than MAX_SCORE."""
+    return line[:: max(1, -(-len(line) // MAX_SCORE))]
+
+
+def closed(line: np.ndarray) -> np.ndarray:
+    """The segments (k, 2, 3) of a closed line (k, 3)."""
+    return np.stack([line, np.roll(line, -1, axis=0)], axis=1)

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from render.viewer import B_MODE, DOPPLER, SCANNER_GROUPS, TGC, Geometry, Settings
+from render.viewer import B_MODE, DOPPLER, RESECTION, SCANNER_GROUPS, TGC, Geometry, Settings
 from render.window_layout import Rect, WindowLayout
 
 # Dear ImGui's glyphs are 7 pixels wide, its rows 23 pixels high. A slider's label gets 35 % of a box, a switch's all of it, less
@@ -32,8 +32,9 @@ def boxes_of(settings: Settings, geometry: Geometry, layout: WindowLayout) -> di
     while len(below) > 1 and sum(below.values()) > layout.slider_room(len(below)):
         del below[next(iter(below))]
     boxes = dict(zip(below, layout.sliders(list(below.values())), strict=True))
-    if settings.show_scanner:
-        shown = [B_MODE, TGC if settings.doppler == "off" else DOPPLER]
+    shown = [B_MODE, TGC if settings.doppler == "off" else DOPPLER] if settings.show_scanner else []
+    shown += [RESECTION] if settings.show_resection else []
+    if shown:
         heights = [ROW_HEIGHT * len(groups[name]) + 32 for name in shown]
         boxes |= dict(zip(shown, layout.scanner_sliders(heights), strict=True))
     return boxes

@@ -14,9 +14,9 @@ from ultrasound.target import Target
 Technique = Literal["enucleation", "enucleoresection", "wedge"]
 TECHNIQUES: tuple[Technique, ...] = get_args(Technique)
 
-B_MODE, TGC, DOPPLER = "B-mode", "TGC", "Doppler"
-# Groups of settings beside the image, as on a scanner: one of the last two is shown.
-SCANNER_GROUPS = (B_MODE, TGC, DOPPLER)
+B_MODE, TGC, DOPPLER, RESECTION = "B-mode", "TGC", "Doppler", "Resection"
+# Groups of settings beside the image, as on a scanner: TGC or Doppler, and those of a resection, where the user asks for them.
+SCANNER_GROUPS = (B_MODE, TGC, DOPPLER, RESECTION)
 
 
 def _slider(default, label: str, unit: str, low, high, group: str):
@@ -104,9 +104,10 @@ class PlanSettings:
 class ResectionSettings:
     """How the next cut is made; its margin is that of the plan."""
 
-    cut_depth_mm: int = _slider(0, "Depth", "mm", 0, 60, "Resection")
+    cut_depth_mm: int = _slider(0, "Cut", "mm", 0, 60, RESECTION)
     """Below the score; 0: as deep as tumour and margin were seen in the image."""
-    air_in_crater: bool = _switch(False, "Air in the crater", "Resection")
+    air_in_crater: bool = _switch(False, "Air in crater", RESECTION)
+    show_resection: bool = False
     technique: Technique = "enucleoresection"
 
 
@@ -139,6 +140,8 @@ class Geometry:
     """Other structures in the organ, by tissue."""
     support: Surface | None = None
     """It does not move."""
+    specimen: Surface | None = None
+    """What was cut out, beside the organ. It does not move."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +154,20 @@ class Guidance:
     """Path of the centre of the array face, segments of shape (n, 2, 3)."""
     done: np.ndarray
     """Whether each segment is done, bool, shape (n,)."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """The score on the organ, as it lies now [mm]."""
+
+    line_mm: np.ndarray
+    """Points of the closed line, shape (k, 3); none of it where there is no line yet."""
+    marks_mm: np.ndarray
+    """Shape (n, 3)."""
+    is_near: np.ndarray
+    """Whether each point of the line is nearer to the tumour than the margin asks, bool, shape (k,)."""
+    planned_mm: np.ndarray
+    """Points of the planned closed line, shape (p, 3); none of it without a plan."""
 
 
 @dataclass(frozen=True)
@@ -178,6 +195,9 @@ class View:
     """Outline of the tumour: segments on the plane, shape (n, 2, 2) [mm], x from the centre to the right, y down from the face."""
     outline_before_mm: np.ndarray | None = None
     """The same at rest, in the CT."""
+    resection_mm: np.ndarray | None = None
+    """The same of the resection surface that a cut would have now."""
+    score: Score | None = None
     seen: dict[str, np.ndarray] = field(default_factory=dict)
     """Coverage: whether the tissue at each vertex of "organ" and "tumour" has been imaged, bool, shape (n,)."""
     guidance: Guidance | None = None

@@ -120,6 +120,12 @@ class Window:
         self._is_ahead = False
         self._seen: tuple[object, ...] = ()
 
+    def change_geometry(self, geometry: Geometry) -> None:
+        """Show other surfaces from now on, with camera and settings as they are."""
+        self._geometry = geometry
+        self._scene_view = SceneView(geometry, self.camera)
+        self._seen = ()
+
     def prepare(self, view: View) -> None:
         """Where the processor draws the 3D view, draw it once without showing it, so that the first `draw` need not wait for its kernels."""
         if self._software is not None:
@@ -153,7 +159,8 @@ class Window:
         if self._drag is not None:
             {"orbit": self.camera.orbit, "pan": self.camera.pan}[self._drag](*self._moved)
         controls.press = self._pressing
-        if self._drag is None and self._over_scene():
+        # With shift the mouse marks the score, and the probe stays where it is.
+        if self._drag is None and self._over_scene() and not self._window.is_pressed(ti.ui.SHIFT):
             controls.ray = self.camera.ray(self._cursor)
         if self._gamepad is not None:
             self._gamepad.read(controls, elapsed)
@@ -198,7 +205,10 @@ class Window:
                 self._drag = None
 
     def _key_down(self, key: str, controls: Controls) -> None:
-        if key == ti.ui.LMB:
+        with_shift = self._window.is_pressed(ti.ui.SHIFT)
+        if key == ti.ui.LMB and with_shift and self._over_scene():
+            controls.score_under = self.camera.ray(self._cursor)
+        elif key == ti.ui.LMB:
             self._pressing = self._over_scene()
             self._before_drag = None
             if self._cursor is not None:
@@ -206,9 +216,9 @@ class Window:
             if not self._pressing and self._cursor is not None:
                 self._before_drag = self._cursor, dataclasses.astuple(self.settings)
         elif key in (ti.ui.RMB, ti.ui.MMB) and self._over_scene():
-            pans = key == ti.ui.MMB or self._window.is_pressed(ti.ui.SHIFT)
+            pans = key == ti.ui.MMB or with_shift
             self._drag = "pan" if pans else "orbit"
-        elif (action := self.keys.action_of(key)) == "help":
+        elif (action := self.keys.action_of(key, with_shift)) == "help":
             self._help_shown = not self._help_shown
         else:
             begin(action, controls)

@@ -18,10 +18,12 @@ from sim.lattice import (
     shares,
     surface_points,
 )
-from sim.signed_distance import signed_distance
+from sim.signed_distance import clipped_distance_grid
 
 # The spacing of points on the new surface grows by this factor until there are no more of them than were removed.
 COARSER = 1.1
+# Rounding of points on the surface of what is removed.
+NEAR_MM = 0.1
 
 
 @dataclass(frozen=True)
@@ -41,13 +43,17 @@ class RemovedTissue:
 
     def is_removed(self, points: np.ndarray) -> np.ndarray:
         """Which points (n, 3) of the organ's surface are of the removed part."""
+        low, high = self.removed.bounds
+        gone = ((points >= low - NEAR_MM) & (points <= high + NEAR_MM)).all(axis=1)
+        near = np.asarray(points[gone], float)
         distances = [
             igl.point_mesh_squared_distance(
-                np.asarray(points, float), np.asarray(each.vertices, float), np.asarray(each.faces, np.int64)
+                near, np.asarray(each.vertices, float), np.asarray(each.faces, np.int64)
             )[0]
             for each in (self.removed, self.remaining)
         ]
-        return distances[0] < distances[1]
+        gone[gone] = distances[0] < distances[1]
+        return gone
 
 
 def lattice_without(lattice: Lattice, tissue: RemovedTissue, parts: Sequence[trimesh.Trimesh]) -> Lattice:
@@ -55,32 +61,49 @@ def lattice_without(lattice: Lattice, tissue: RemovedTissue, parts: Sequence[tri
 
     Empty cells have neither volume nor gradients, and are at no position of ``index_of``. ``parts`` are those of the lattice.
     """
-    cell_mm, low = lattice.cell_mm, lattice.low_mm
-    grid = np.argwhere(lattice.index_of >= 0)
-    cells = lattice.index_of[tuple(grid.T)]
-    removed = tissue.removed
-    near = (
-        (grid >= (removed.bounds[0] - low) / cell_mm - 2) & (grid <= (removed.bounds[1] - low) / cell_mm + 1)
-    ).all(axis=1)
-    grid, cells = grid[near], cells[near]
-    centre = signed_distance(removed.vertices, removed.faces, low + cell_mm * (grid + 0.5))[0]
-    reach = cell_mm * np.sqrt(3) / 2
-    lost = cells[centre <= -reach]
-    grid, cells = grid[np.abs(centre) < reach], cells[np.abs(centre) < reach]
-    samples = low + cell_mm * (grid[:, None] + SAMPLE_POINTS)
-    remaining = tissue.remaining
-    distance = signed_distance(remaining.vertices, remaining.faces, samples.reshape(-1, 3))[0]
-    filled = np.clip(0.5 - distance.reshape(len(grid), -1) / (cell_mm / SAMPLES), 0, 1)
-    has_tissue = filled.sum(axis=1) > 0
-    lost = np.concatenate([lost, cells[~has_tissue]])
-    grid, cells, filled = grid[has_tissue], cells[has_tissue], filled[has_tissue]
+    box = _box_around(lattice, tissue.removed)
+    grid = np.argwhere(lattice.index_of[box] >= 0)
+    cells = lattice.index_of[box][tuple(grid.T)]
+    first = np.array([each.start for each in box])
+    removed, filled = (
+        _filled(lattice, surface, first, lattice.index_of[box].shape)[tuple(grid.T)]
+        for surface in (tissue.removed, tissue.remaining)
+    )
+    changed, has_tissue = removed.any(axis=1), filled.any(axis=1)
+    lost = cells[changed & ~has_tissue]
+    kept = changed & has_tissue
+    grid, cells, filled = grid[kept] + first, cells[kept], filled[kept]
     new = _copied(lattice)
     _fill_cells(new, cells, filled)
-    new.share[cells] = shares(filled, grid, low, cell_mm, parts)
+    new.share[cells] = shares(filled, grid, lattice.low_mm, lattice.cell_mm, parts)
     for array in (new.gradient, new.volume, new.hourglass, new.tissue, new.share):
         array[lost] = 0.0
     new.index_of[np.isin(new.index_of, lost)] = -1
     return new
+
+
+def _box_around(lattice: Lattice, surface: trimesh.Trimesh) -> tuple[slice, slice, slice]:
+    """The positions of the lattice's grid that a surface extends over."""
+    low, high = (surface.bounds - lattice.low_mm) / lattice.cell_mm
+    first = np.clip(np.floor(low).astype(int), 0, lattice.index_of.shape)
+    last = np.clip(np.ceil(high).astype(int), 0, lattice.index_of.shape)
+    return tuple(slice(a, b) for a, b in zip(first, last, strict=True))  # type: ignore[return-value]
+
+
+def _filled(
+    lattice: Lattice, surface: trimesh.Trimesh, first: np.ndarray, shape: tuple[int, ...]
+) -> np.ndarray:
+    """Fraction (x, y, z, s) inside a surface around each integration point of the cells from a position of the grid on."""
+    sample_mm = lattice.cell_mm / SAMPLES
+    low = lattice.low_mm + lattice.cell_mm * first + sample_mm / 2
+    x, y, z = (SAMPLES * count for count in shape)
+    distance = clipped_distance_grid(
+        surface.vertices, surface.faces, low, (x, y, z), sample_mm, 2 * sample_mm
+    )
+    by_cell = distance.reshape(shape[0], SAMPLES, shape[1], SAMPLES, shape[2], SAMPLES).transpose(
+        0, 2, 4, 1, 3, 5
+    )
+    return np.clip(0.5 - by_cell.reshape(*shape, SAMPLES**3) / sample_mm, 0, 1)
 
 
 def _copied(lattice: Lattice) -> Lattice:

@@ -51,11 +51,52 @@ def _distances(
     """As ``distance_grid``, computed."""
     low = vertices.min(axis=0) - reach_mm
     shape = np.ceil((vertices.max(axis=0) + reach_mm - low) / spacing_mm).astype(int) + 1
-    squared = np.full(tuple(shape), EXACT_MM**2, np.float32)
-    _squares_near(((vertices - low) / spacing_mm).astype(np.float32)[faces], spacing_mm, EXACT_MM, squared)
-    exact = np.sqrt(squared.ravel().astype(np.float64))
+    exact = _distances_near(vertices, faces, low, shape, spacing_mm, EXACT_MM)
     coarse = np.maximum(_coarse_distances(vertices, faces, low, shape, spacing_mm), EXACT_MM)
     distance = np.where(exact < EXACT_MM, exact, coarse)
+    return (_signs(vertices, faces, low, shape, spacing_mm, distance) * distance).reshape(shape), low
+
+
+def clipped_distance_grid(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    low: np.ndarray,
+    shape: tuple[int, int, int],
+    spacing_mm: float,
+    within_mm: float,
+) -> np.ndarray:
+    """Signed distances (nx, ny, nz) [mm] to a closed surface on a grid with its first point at ``low`` (3,): exact to float32 up to
+    ``within_mm``, which is at least the spacing, and beyond it that with the sign.
+    """
+    vertices, faces = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
+    size = np.array(shape)
+    distance = _distances_near(vertices, faces, low, size, spacing_mm, within_mm)
+    return (_signs(vertices, faces, low, size, spacing_mm, distance) * distance).reshape(shape)
+
+
+def _distances_near(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    low: np.ndarray,
+    shape: np.ndarray,
+    spacing_mm: float,
+    within_mm: float,
+) -> np.ndarray:
+    """Distances (n,) [mm] of a grid's points, at most ``within_mm``."""
+    squared = np.full(tuple(shape), within_mm**2, np.float32)
+    _squares_near(((vertices - low) / spacing_mm).astype(np.float32)[faces], spacing_mm, within_mm, squared)
+    return np.sqrt(squared.ravel().astype(np.float64))
+
+
+def _signs(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    low: np.ndarray,
+    shape: np.ndarray,
+    spacing_mm: float,
+    distance: np.ndarray,
+) -> np.ndarray:
+    """-1 (n,) for a grid's points inside a surface, 1 for those outside; ``distance`` (n,) [mm] is how far they are from it."""
     # Neighbours that are both farther from the surface than half their distance are on the same side of it.
     near = distance <= NEAR_CELLS * spacing_mm
     region = label(~near.reshape(shape))[0].ravel()
@@ -65,7 +106,7 @@ def _distances(
     inside = igl.fast_winding_number(vertices, faces, points) > 0.5
     sign = np.where(inside[: len(samples)], -1.0, 1.0)[region]
     sign[near] = np.where(inside[len(samples) :], -1.0, 1.0)
-    return (sign * distance).reshape(shape), low
+    return sign
 
 
 def _coarse_distances(

@@ -102,6 +102,9 @@ def test_a_headless_press_reports_what_it_promises(pressed):
     assert 0.95 < report["volume_ratio_min"] <= 1.01
     assert report["max_penetration_mm"] <= 0.8
     assert report["indentation_max_mm"] == pytest.approx(6.0, abs=1e-3)
+    assert (
+        report["complexity"]["renal"]["complexity"] == "moderate" and report["complexity"]["not_known"] == []
+    )
     assert (report["picture"], report["detail_level"]) == ("both", "speckle") and report["probe"].startswith(
         "Drop-in"
     )

@@ -1,10 +1,12 @@
 """The command ``plan``: a sweep that covers a target with little compression, through a trocar."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import click
+import numpy as np
 from pydantic import Field, ValidationError
+from tabulate import tabulate
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import (
@@ -17,9 +19,14 @@ from rehearsal.commands.command_line import (
 )
 from rehearsal.configuration import probe_of
 from rehearsal.planning.plan_file import FASTEST_MM_S, MOST_MARGIN_MM, MOST_SWEEPS, SLOWEST_MM_S, write_plan
+from scenes.anatomy import fingerprint
 from scenes.scene import EMBEDDED, Trocar
 from scenes.terminal import shell_command
 from ultrasound.target import Target
+from version import VERSION
+
+if TYPE_CHECKING:
+    from rehearsal.resection.proposal import Proposal
 
 
 class PlanOptions(QualityOptions):
@@ -28,6 +35,8 @@ class PlanOptions(QualityOptions):
     scene: Annotated[Path, ARGUMENT] = EMBEDDED
     out: Path
     """File for the plan, JSON."""
+    resect: bool = False
+    """Plan a resection of the tumour with the margin, instead of a sweep of the probe."""
     target: Target | None = None
     """What the sweep covers: the tumour, the tumour with its margin, or the whole organ [margin, or organ without a tumour]."""
     margin_mm: float = Field(5.0, ge=0, le=MOST_MARGIN_MM)
@@ -52,10 +61,13 @@ class PlanOptions(QualityOptions):
 
 @command(PlanOptions)
 def plan(asked: PlanOptions) -> None:
-    """Plan a sweep over SCENE that covers the target.
+    """Plan a sweep over SCENE that covers the target, or a resection.
 
     SCENE is a scene file or a patient's folder. The organ deforms under the probe.
     """
+    if asked.resect:
+        plan_resection(asked)
+        return
     out = asked.out
     loaded, anatomy = load_patient(asked.scene, asked.changes, asked.quality)
     port, scene_probe = trocar_of(loaded.trocar, asked), probe_of(loaded)
@@ -80,6 +92,53 @@ def plan(asked: PlanOptions) -> None:
     click.echo(
         f"Wrote {len(made.sweeps)} sweeps to {out}; follow the first with: {rehearse_command_line(asked.scene, out, asked.probe)}"
     )
+
+
+def plan_resection(asked: PlanOptions) -> None:
+    """Propose technique and line of a resection, and write them. Raises CommandError, ResectionError."""
+    from rehearsal.resection.proposal import propose
+    from rehearsal.resection.resection_plan import ResectionPlan, planned_cut, write_resection_plan
+
+    _, anatomy = load_patient(asked.scene, asked.changes, asked.quality)
+    if anatomy.tumour is None:
+        raise CommandError("--resect: this patient has no tumour; name its label when you import the patient")
+    make_place(asked.out, "--out")
+    proposals = propose(
+        anatomy.organ, anatomy.tumour, anatomy.parts, asked.margin_mm, anatomy.labels, anatomy.tissues
+    )
+    cuts = [planned_cut(proposal, np.zeros(3)) for proposal in proposals]
+    write_resection_plan(
+        ResectionPlan(version=VERSION, anatomy=fingerprint(anatomy), margin_mm=asked.margin_mm, cuts=cuts),
+        asked.out,
+    )
+    click.echo(table_of(proposals))
+    click.echo(
+        f"Wrote {len(cuts)} cuts to {asked.out}; rehearse the first with: {rehearse_command_line(asked.scene, asked.out, asked.probe)}"
+    )
+
+
+def table_of(proposals: list["Proposal"]) -> str:
+    """The proposals with their main figures, for the terminal."""
+    heads = [
+        "technique",
+        "cost, ml",
+        "least margin, mm",
+        "parenchyma, ml",
+        "collecting system, mm2",
+        "vessels",
+    ]
+    rows = [
+        [
+            each.settings.technique,
+            each.cost_ml,
+            each.judgement.margin.margin_mm.min(),
+            each.judgement.parenchyma_removed_ml,
+            each.judgement.collecting_system_opened_mm2,
+            len(each.judgement.vessels),
+        ]
+        for each in proposals
+    ]
+    return tabulate(rows, heads, floatfmt=".1f")
 
 
 def rehearse_command_line(scene: Path, plan_file: Path, probe: str | None) -> str:

@@ -78,7 +78,7 @@ class RehearseOptions(LinkOptions, ImageOptions, QualityOptions, ArchOptions):
     keys: Path | None = None
     """Your own key map: a TOML file as printed by app.py keys."""
     plan: Path | None = None
-    """A sweep to follow: a file of app.py plan."""
+    """A sweep to follow, or a resection to compare with: a file of app.py plan."""
     out: Path = Path("out")
     """Folder for images and report; a run without a window replaces those of an earlier one."""
     model: Annotated[str | None, click.Choice(list(TISSUES))] = None

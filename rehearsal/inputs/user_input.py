@@ -13,13 +13,13 @@ from rehearsal.pressed_organ import Step
 from rehearsal.real_time.solver_process import SolverProcess
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.operation import cut, mark_under, marks_of_image, places_at_rest, set_marks
+from rehearsal.resection.resection_view import cut_settings
 from rehearsal.resection.script import ResectionScript, ScriptedAction
 from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import set_solver
 from rehearsal.sessions.session import History, Session
 from rehearsal.tracking.tracked_probe import PoseSource, TrackEnded, TrackingInput
-from render.viewer import Controls, Settings, TissueSettings
-from ultrasound.crater import Filling
+from render.viewer import Controls, TissueSettings
 
 # A transducer that moves by no more than this in a step is at rest [mm].
 STILL_MM = 1e-3
@@ -166,9 +166,13 @@ class UserInput:
     def _cut(self, settings: CutSettings) -> None:
         coverage = self.session.coverage
         cut(self.session, settings, None if coverage is None else coverage().is_seen)
-        made = self.session.rehearsal.cut
-        for warning in made.warnings if made is not None else ():
-            self._show(warning)
+        made, judgement = self.session.rehearsal.cut, self.session.rehearsal.judgement
+        warnings = [
+            *(made.warnings if made is not None else ()),
+            *(judgement.warnings() if judgement is not None else ()),
+        ]
+        for warning in warnings:
+            self.notices.post(f"Warning: {warning}")
 
     def _act(self, action: Callable[[], None]) -> None:
         """Do something that undo reverts; say why it cannot be done."""
@@ -275,13 +279,6 @@ def solver_values(settings: TissueSettings) -> dict[str, Any]:
         gravity_m_s2=settings.gravity_m_s2,
     )
     return {name: value for name, value in values.items() if value is not None}
-
-
-def cut_settings(settings: Settings) -> CutSettings:
-    """How the sliders say that the next cut is made."""
-    depth_mm = float(settings.cut_depth_mm) or None
-    filling: Filling = "air" if settings.air_in_crater else "fluid"
-    return CutSettings(settings.technique, float(settings.margin_mm), depth_mm, filling)
 
 
 def acts(controls: Controls, ray: Ray | None) -> bool:

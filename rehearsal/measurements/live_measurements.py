@@ -10,6 +10,7 @@ from rehearsal.measurements.tumour_measurements import Measurement, measure
 from rehearsal.measurements.uncertainty_bands import UncertaintyBands
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.rehearsal import Rehearsal
+from rehearsal.resection.judgement import findings_of
 from rehearsal.sessions.packed_arrays import unpack_seen
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import Log, SessionError
@@ -177,14 +178,22 @@ class LiveMeasurements:
             view,
             findings=self._findings,
             alert=COMPRESSION if self.is_over_limit else "",
-            seen=self._seen if settings.show_seen else {},
+            seen=self._shown_coverage() if settings.show_seen else {},
             guidance=self.guide.guidance() if self.guide is not None else None,
             status=status,
             notes={B_MODE: "NO CONTACT"} if self._touches.mean() < LEAST_CONTACT else {},
         )
 
+    def _shown_coverage(self) -> dict[str, np.ndarray]:
+        """What was imaged of each surface, unless a cut has changed the surface since."""
+        surfaces = {"organ": self.rehearsal.organ, "tumour": self.rehearsal.tumour}
+        counts = {name: len(each.vertices) for name, each in surfaces.items() if each is not None}
+        return {name: seen for name, seen in self._seen.items() if counts.get(name) == len(seen)}
+
     def findings(self) -> dict[str, str]:
         """Name -> figure with its unit."""
+        if self.rehearsal.judgement is not None:
+            return findings_of(self.rehearsal.judgement)
         found, plan = self._tissue_findings(), self.guide.figures() if self.guide is not None else {}
         if plan:
             off_mm, off_deg = plan["plan_off_mm"], plan["plan_off_deg"]

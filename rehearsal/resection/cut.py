@@ -194,9 +194,13 @@ def faces_of(surface: trimesh.Trimesh, chosen: np.ndarray) -> trimesh.Trimesh:
     return part
 
 
-def part_outside(part: trimesh.Trimesh, cut: Cut | None) -> trimesh.Trimesh | None:
-    """The surface of what remains of a part of the organ after a cut; None where next to nothing does. Raises PatientError."""
+def part_left(part: trimesh.Trimesh, cut: Cut | None, is_within: bool = False) -> trimesh.Trimesh | None:
+    """The surface of what a cut leaves of a part of the organ; None where next to nothing is left. Raises PatientError.
+
+    What is outside of the organ stays, as of vessels at the hilum; for a part ``is_within`` the organ, that is the error of its surface.
+    """
     if cut is None:
         return part
-    left = solid_of(part, "part") - solid_of(cut.specimen, "specimen")
+    solid = solid_of(part, "part")
+    left = solid ^ solid_of(cut.remnant, "organ") if is_within else solid - solid_of(cut.specimen, "specimen")
     return surface_of(left)[0] if left.volume() > LEAST_LEFT_MM3 else None

@@ -24,6 +24,10 @@ MARGIN_LIMITS_MM = (1.0, 3.0, 5.0)
 # Parts of an organ that are not parenchyma.
 NOT_PARENCHYMA = ("tumour", "cyst", "urine", "vessel", "sinus")
 VESSELS = ("artery", "vein", "vessel")
+# Segmental vessels are narrower.
+MAIN_VESSEL_MM = 5.0
+# A cut that is no farther inside a surface runs along it.
+SURFACE_ERROR_MM = 0.1
 # A cut of less area through a vessel or the collecting system is within the error of their surfaces.
 LEAST_OPENED_MM2 = 0.5
 
@@ -58,6 +62,11 @@ class MarginMap:
         """Area [mm^2] with less margin than a limit."""
         return float(self.area_mm2[self.distance_mm < limit_mm].sum())
 
+    @property
+    def positive_mm2(self) -> float:
+        """Area [mm^2] of the cut in the tumour."""
+        return self.area_below(-SURFACE_ERROR_MM)
+
 
 @dataclass(frozen=True)
 class Judgement:
@@ -76,6 +85,20 @@ class Judgement:
     vessels: tuple[DividedVessel, ...]
     volume_change_percent: float
 
+    def warnings(self) -> list[str]:
+        """What a surgeon would want to know at once."""
+        found = []
+        if self.margin.positive_mm2 > 0:
+            found.append(
+                f"the cut goes through the tumour over {self.margin.positive_mm2:.0f} mm2; {self.tumour_left_ml:.1f} ml of it are left"
+            )
+        wide = [vessel for vessel in self.vessels if vessel.diameter_mm >= MAIN_VESSEL_MM]
+        if wide:
+            found.append(
+                f"the cut divides a {wide[0].tissue} of {wide[0].diameter_mm:.1f} mm, as wide as a main vessel"
+            )
+        return found
+
     def report(self) -> dict:
         """The figures for ``report.json``."""
         margin = self.margin
@@ -88,7 +111,7 @@ class Judgement:
                 f"margin_below_{limit:g}_mm2": round(margin.area_below(limit), 1)
                 for limit in MARGIN_LIMITS_MM
             },
-            positive_margin_mm2=round(margin.area_below(0.0), 1),
+            positive_margin_mm2=round(margin.positive_mm2, 1),
             tumour_left_ml=round(self.tumour_left_ml, 3),
             specimen_ml=round(float(self.specimen_ml), 3),
             parenchyma_removed_ml=round(self.parenchyma_removed_ml, 3),
@@ -219,3 +242,19 @@ def _vessel_at(points: np.ndarray, labels: Grid | None, tissues: Mapping[int, st
     names = [tissues.get(int(value), "") for value in labels.voxels[tuple(index.T)]]
     counts = {name: names.count(name) for name in VESSELS}
     return max(counts, key=counts.__getitem__) if any(counts.values()) else "vessel"
+
+
+def findings_of(judgement: Judgement) -> dict[str, str]:
+    """Name -> figure with its unit, of a cut, for the window."""
+    margin = judgement.margin
+    found = {
+        "least margin": f"{margin.margin_mm.min():.1f} mm",
+        "positive margin": f"{margin.positive_mm2:.0f} mm2",
+        "specimen": f"{judgement.specimen_ml:.1f} ml",
+        "parenchyma": f"-{judgement.parenchyma_removed_ml:.1f} ml ({judgement.parenchyma_removed_percent:.1f} %)",
+        "calyces opened": f"{judgement.collecting_system_opened_mm2:.0f} mm2",
+    }
+    if judgement.vessels:
+        widest = judgement.vessels[0]
+        found["vessels cut"] = f"{len(judgement.vessels)}, {widest.tissue} {widest.diameter_mm:.1f} mm"
+    return found

@@ -1,16 +1,29 @@
-"""A proposal of a score: the line on the capsule around tumour and margin, for a direction of the cut."""
+"""Proposals of a resection: lines on the capsule around tumour and margin, and what a cut along each would take."""
+
+import contextlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
 
-from rehearsal.resection.cut import grown
-from rehearsal.resection.score_line import places_on
+from rehearsal.resection.cut import CutSettings, cut_organ, grown
+from rehearsal.resection.judgement import Carried, Judgement, judge
+from rehearsal.resection.score_line import ResectionError, ScoreLine, places_on, score_line
+from scenes.anatomy import Grid
 from scenes.solids import solid_of
 
 MARKS = 16
 # The line is this much wider than tumour and margin, so that the walls of the cut are not in the margin.
 SLACK_MM = 0.5
+# The walls of a wedge are oblique: its line is this much wider.
+WEDGE_WIDER_MM = 4.0
+# A line's direction is found in so many turns at most, to the first cosine; lines below the second are different.
+MOST_TURNS, SAME_DIRECTION, DIFFERENT_DIRECTION = 10, 0.9999, 0.99
+# Weights, chosen by us: 100 mm2 of opened collecting system, or a vessel of 3 mm, count as 1 ml of parenchyma, a missing millimetre of margin
+# as 5 ml, and 1 cm2 of tumour left as 50 ml. A margin counts as kept within the last value.
+OPENED_ML_MM2, VESSEL_ML_MM2, MISSING_ML_MM, LEFT_ML_MM2, KEPT_WITHIN_MM = 0.01, 0.14, 5.0, 0.5, 0.1
 
 
 def marks_around(
@@ -37,3 +50,87 @@ def marks_around(
         # Beside the organ: its nearest place.
         marks.append(hits[0].position if hits else np.array([*edge, height]) @ axes)
     return places_on(organ, np.array(marks))[0]
+
+
+def line_around(
+    organ: trimesh.Trimesh, tumour: trimesh.Trimesh, margin_mm: float, direction: np.ndarray
+) -> ScoreLine:
+    """The line around a tumour and a margin, seen along its own direction, which is found from another (3,). Raises ResectionError."""
+    for _ in range(MOST_TURNS):
+        line = score_line(organ, marks_around(organ, tumour, margin_mm, direction))
+        turned, direction = line.direction @ direction, line.direction
+        if turned > SAME_DIRECTION:
+            break
+    return line
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A technique and a line, with the figures of the cut in the patient at rest; ``cost_ml`` is what it takes, in ml of parenchyma."""
+
+    settings: CutSettings
+    line: ScoreLine
+    judgement: Judgement
+
+    @property
+    def cost_ml(self) -> float:
+        """See ``cost_ml``."""
+        return cost_ml(self.judgement, self.settings.margin_mm)
+
+
+def cost_ml(judgement: Judgement, margin_mm: float) -> float:
+    """Parenchyma removed [ml]; an opened collecting system, divided vessels, and margin that is missing count as so many ml more."""
+    opened = OPENED_ML_MM2 * judgement.collecting_system_opened_mm2
+    vessels = VESSEL_ML_MM2 * sum(np.pi / 4 * vessel.diameter_mm**2 for vessel in judgement.vessels)
+    missing = max(margin_mm - float(judgement.margin.margin_mm.min()) - KEPT_WITHIN_MM, 0.0)
+    left = LEFT_ML_MM2 * judgement.margin.positive_mm2
+    return judgement.parenchyma_removed_ml + opened + vessels + MISSING_ML_MM * missing + left
+
+
+def propose(
+    organ: trimesh.Trimesh,
+    tumour: trimesh.Trimesh,
+    parts: Mapping[str, trimesh.Trimesh],
+    margin_mm: float,
+    labels: Grid | None = None,
+    tissues: Mapping[int, str] | None = None,
+) -> list[Proposal]:
+    """Cuts of an organ at rest around its tumour with a margin [mm], the best first: at most one for each technique and direction.
+
+    Raises ResectionError where none can be made.
+    """
+    settings = [CutSettings("enucleoresection", margin_mm), CutSettings("wedge", margin_mm)]
+    if margin_mm == 0:
+        settings = [CutSettings("enucleation", 0.0), *settings[1:]]
+    at_rest = Carried(*(np.asarray(each.vertices, float) for each in (organ, organ, organ, tumour)))
+    found = []
+    for each in settings:
+        beyond_mm = WEDGE_WIDER_MM if each.technique == "wedge" else 0.0
+        for line in _lines(organ, tumour, margin_mm + beyond_mm):
+            try:
+                cut = cut_organ(organ, line, each, np.asarray(tumour.vertices))
+            except ResectionError:
+                continue
+            carried = replace(
+                at_rest, specimen=np.asarray(cut.specimen.vertices), remnant=np.asarray(cut.remnant.vertices)
+            )
+            judged = judge(cut, organ, tumour, parts, carried, labels, tissues)
+            found.append(Proposal(each, line, judged))
+    if not found:
+        raise ResectionError(
+            f"no cut with a margin of {margin_mm:g} mm around this tumour leaves most of the kidney; choose a smaller margin"
+        )
+    return sorted(found, key=lambda proposal: proposal.cost_ml)
+
+
+def _lines(organ: trimesh.Trimesh, tumour: trimesh.Trimesh, margin_mm: float) -> list[ScoreLine]:
+    """Different lines around a tumour, found from directions on all sides of the organ that are near to it."""
+    outward = places_on(organ, tumour.center_mass[None])[1][0]
+    starts = [outward, *(each for each in trimesh.creation.icosahedron().vertices if each @ outward > 0)]
+    lines: list[ScoreLine] = []
+    for start in starts:
+        with contextlib.suppress(ResectionError):
+            line = line_around(organ, tumour, margin_mm, start)
+            if all(line.direction @ other.direction < DIFFERENT_DIRECTION for other in lines):
+                lines.append(line)
+    return lines

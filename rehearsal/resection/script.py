@@ -13,7 +13,7 @@ from ultrasound.crater import Filling
 Number = Annotated[float, Field(ge=-1e5, le=1e5)]
 
 
-class CutValues(BaseModel):
+class ScriptedCut(BaseModel):
     """A cut in a file; see ``CutSettings``."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)

@@ -62,7 +62,7 @@ class SolverValues(TypedDict, total=False):
     gravity_m_s2: Annotated[float, Field(ge=0, le=100)]
 
 
-class CutValues(TypedDict):
+class RecordedCut(TypedDict):
     """A cut along the score: see ``CutSettings``; ``seen`` has a bit for each vertex of the tumour's surface, as base64."""
 
     __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)  # type: ignore[misc]
@@ -81,7 +81,7 @@ VALUES: dict[str, TypeAdapter] = {
     "back": TypeAdapter(int),
     "bookmark": TypeAdapter(int),
     "marks": TypeAdapter(Annotated[list[Place], Field(max_length=MOST_MARKS)]),
-    "cut": TypeAdapter(CutValues),
+    "cut": TypeAdapter(RecordedCut),
     "reading": TypeAdapter(dict[str, float | None]),
     "state": TypeAdapter(str),
     "seen": TypeAdapter(Seen),

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from errors import UserError
-from rehearsal.resection.script import CutValues, Number, ScriptedAction
+from rehearsal.resection.script import Number, ScriptedAction, ScriptedCut
 from ultrasound.probe_manipulator import interpolated
 
 # Tolerance of orthonormal axes: more than the rounding of six digits in a file or of a float32, less than a scaled matrix.
@@ -63,7 +63,7 @@ class _FilePose(BaseModel):
     score: Literal["image"] | list[Place] | None = None
     """Set marks of the score: at the edges of tumour and margin in the image, or at these places (LPS, mm)."""
     margin_mm: float = Field(5.0, ge=0, le=20)
-    cut: CutValues | None = None
+    cut: ScriptedCut | None = None
     """Cut along the score."""
 
     def action(self, from_s: float) -> ScriptedAction | None:

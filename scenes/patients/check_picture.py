@@ -17,6 +17,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from scenes.patients.organ_selection import HILAR
 from scenes.patients.part_surfaces import PARTS, PEDICLE_MM
+from scenes.patients.patient_complexity import complexity_of_patient
 from scenes.patients.patient_import import Patient
 from scenes.patients.readers.label_maps import Colour
 from scenes.volumes.lazy_volume import AIR_HU
@@ -30,12 +31,16 @@ COLOUR = {
     "tumour": "#ffe14d",
     "cyst": "#4dd2ff",
     "urine": "#b6ff6b",
+    "sinus": "#ff9df5",
     "vessel": "#ff3b5c",
     "support": "#b99cff",
 }
 WORD = {"organ": "kidney", "urine": "collecting system", "vessel": "vessels"}
 LEAST_BRIGHT = 0.85
+# Letters in a line of the largest text, its sizes [points], and lines times size that fit above the names of the colours.
 TEXT_WIDTH = 56
+TEXT_POINTS = (8.5, 8.0, 7.5, 7.0, 6.5, 6.0, 5.5, 5.0)
+TEXT_HEIGHT = 188.0
 # White with a black outline, readable on bone and on air.
 LETTER: dict[str, Any] = dict(
     color="white",
@@ -89,6 +94,8 @@ def summary_rows(patient: Patient) -> list[tuple[str, str]]:
             rows.append((word, f"{volumes[tissue]:.1f} ml, {len(patient.parts[tissue].faces)} faces{where}"))
         elif tissue == "tumour":
             rows.append((word, "none labelled as one"))
+    found = complexity_of_patient(patient)
+    rows += [] if found is None else found.rows()
     rows.append(("support", f"{len(patient.support.faces)} faces, for a patient lying supine"))
     rows.append(("CT", f"{size} voxels of {spacing} mm"))
     return rows + [("note", note) for note in patient.notes]
@@ -225,12 +232,22 @@ def _draw_surfaces(
 
 
 def _draw_words(axes: Axes, rows: list[tuple[str, str]], shown: dict[str, Colour]) -> None:
-    lines = []
-    for word, line in rows:
-        wrapped = textwrap.wrap(line, TEXT_WIDTH - 11) or [""]
-        lines += [(word, wrapped[0]), *(("", more) for more in wrapped[1:])]
     place: dict[str, Any] = dict(transform=axes.transAxes)
-    axes.text(0.0, 0.95, as_table(lines), color="white", family="monospace", fontsize=8.5, va="top", **place)
+    text, points = _fitted(rows)
+    axes.text(0.0, 1.0, text, color="white", family="monospace", fontsize=points, va="top", **place)
     for n, (name, colour) in enumerate(shown.items()):
         left, low = 0.5 * (n % 2), 0.12 - 0.055 * (n // 2)
         axes.text(left, low, WORD.get(name, name), color=colour, fontsize=11, weight="bold", **place)
+
+
+def _fitted(rows: list[tuple[str, str]]) -> tuple[str, float]:
+    """The rows as text, and the largest font size [points] at which it fits above the names of the colours."""
+    for points in TEXT_POINTS:
+        width = round(TEXT_WIDTH * TEXT_POINTS[0] / points)
+        lines = []
+        for word, line in rows:
+            wrapped = textwrap.wrap(line, width - 11) or [""]
+            lines += [(word, wrapped[0]), *(("", more) for more in wrapped[1:])]
+        if len(lines) * points <= TEXT_HEIGHT:
+            break
+    return as_table(lines), points

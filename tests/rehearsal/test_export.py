@@ -135,6 +135,8 @@ def lying(tumour: bool) -> SimpleNamespace:
     return SimpleNamespace(
         origin=MIDDLE,
         organ=rest,
+        cut=None,
+        score=None,
         organ_skin=SimpleNamespace(vertices=field_of(moved, 1)),
         tumour=body(3.0, 0.2) if tumour else None,
         tumour_vertices=lambda: body(3.0, 0.2).vertices - MIDDLE + [1.0, 0, 0],

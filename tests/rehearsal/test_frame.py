@@ -20,6 +20,7 @@ from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.frame import Frames, WindowFrames
 from rehearsal.notices import Notices
 from rehearsal.pressed_organ import Step
+from rehearsal.resection.resection_state import NO_RESECTION
 from render.keys import DEFAULT_KEYS, Keys
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
@@ -39,6 +40,7 @@ class Fake:
         self.probe, self.origin = load_probe("linear"), np.array([100.0, 200.0, 300.0])
         self.settings, self.notice, self.status, self.steps = SimpleNamespace(time_step_s=STEP_S), "", "", 0
         self.pose, self.latest = np.eye(4), None
+        self.resection, self.cut, self.judgement, self.whole_tumour = NO_RESECTION, None, None, None
 
     @property
     def session(self) -> SimpleNamespace:
@@ -450,7 +452,7 @@ def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path
     monkeypatch.setattr(run, "WindowFrames", lambda *fixed, **_: given.append(fixed[4]) or looping)
     monkeypatch.setattr(run, "run_headless", lambda frames, *_: given.append(frames.link))
     monkeypatch.setattr(run, "Session", lambda rehearsal, coverage: None)
-    for name in ("_user_input", "_record", "_end"):
+    for name in ("_user_input", "_record", "_end", "_about_patient"):
         monkeypatch.setattr(run.RehearsalRun, name, lambda *_: SimpleNamespace(bookmarks=0))
     asked = RehearseOptions(out=tmp_path, seconds=1.0)
     each = run.RehearsalRun(Fake(), None, "cpu", asked, FILES, viewer, Fake(), link)

@@ -27,7 +27,17 @@ def rehearsal() -> SimpleNamespace:
     scene = SimpleNamespace(image=image, transducer=SimpleNamespace(compression_warning_mm=8.0))
     plane = SimpleNamespace(rest_grid=lambda count: np.full((count, count, 3), 500.0, np.float32))
     return SimpleNamespace(
-        **vars(over_ball()) | dict(organ=organ, tumour=tumour, scene=scene, probe=load_probe("linear")),
+        **vars(over_ball())
+        | dict(
+            organ=organ,
+            tumour=tumour,
+            whole_organ=organ,
+            whole_tumour=tumour,
+            cut=None,
+            judgement=None,
+            scene=scene,
+            probe=load_probe("linear"),
+        ),
         scanner=SimpleNamespace(plane=plane),
         pose=FIRST[0],
     )

@@ -325,7 +325,7 @@ def test_a_tumour_target_needs_a_tumour(target):
 def test_a_target_without_a_voxel_is_refused(monkeypatch, target, margin):
     speck = trimesh.creation.icosphere(subdivisions=1, radius=0.3).apply_translation([0.7, 0.7, 0.7])
     built = SimpleNamespace(
-        organ=big_ball(), tumour=speck, manipulator=manipulator_on(big_ball()), origin=np.zeros(3)
+        whole_organ=big_ball(), whole_tumour=speck, manipulator=manipulator_on(big_ball()), origin=np.zeros(3)
     )
     monkeypatch.setattr("rehearsal.planning.sweep_trial.Rehearsal", lambda *_: built)
     anatomy = replace(problem_of().anatomy, tumour=speck)

@@ -43,7 +43,7 @@ class Numbers:
         self.pose = self.manipulator.pose()
         self.young_kpa, self.steps = 15.0, 0
         self.resection, self.origin = NO_RESECTION, np.zeros(3)
-        self.whole_organ, self.whole_tumour = ball, None
+        self.whole_organ, self.whole_tumour, self.judgement = ball, None, None
         self.position = np.arange(6, dtype=np.float32).reshape(2, 3)
         self.velocity = np.zeros((2, 3), np.float32)
         self.contacts = {"plane": np.zeros((2, 4), np.float32)}

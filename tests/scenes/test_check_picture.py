@@ -5,6 +5,7 @@ from dataclasses import replace
 import matplotlib.image
 import numpy as np
 import pytest
+from ellipsoid_kidney import ball
 from synthetic_body import LEFT, TUMOUR, body, coarsely, points_of, with_voxels
 
 from scenes.patients.check_picture import (
@@ -18,6 +19,7 @@ from scenes.patients.check_picture import (
     resample_plane,
     summary_rows,
 )
+from scenes.patients.part_surfaces import PARTS
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.label_maps import LabelMap
 from scenes.volumes.lazy_volume import LazyVolume
@@ -137,3 +139,35 @@ def test_the_whole_width_is_shown_where_it_is_wider_than_the_cuts(patient, tmp_p
         panel = matplotlib.image.imread(tmp_path / "check.png")[560:, 460:840, :3]
         grey.append(((np.ptp(panel, axis=2) < 0.01) & (panel[..., 0] > 0.3)).sum())
     assert grey[0] > 20 * grey[1]
+
+
+def test_every_part_is_drawn_in_its_colour(patient, tmp_path):
+    assert set(PARTS) < set(COLOUR)
+    sinus = ball(patient.organ.centroid, 8.0)
+    draw_check(replace(patient, parts={**patient.parts, "sinus": sinus}), summary_rows(patient), tmp_path)
+    picture = matplotlib.image.imread(tmp_path / "check.png")[..., :3]
+    wanted = np.array([int(COLOUR["sinus"][n : n + 2], 16) for n in (1, 3, 5)]) / 255
+    assert (np.abs(picture - wanted).max(axis=2) < 0.1).sum() > 100
+
+
+def test_long_text_ends_above_the_names_of_the_colours(patient, tmp_path):
+    """The text is white, the names are not."""
+    rows = [("WARNING", "a warning of several lines, with what to do " * 5)] * 4 + summary_rows(patient)
+    white = []
+    for lines in (rows, summary_rows(patient)):
+        draw_check(patient, lines, tmp_path)
+        panel = matplotlib.image.imread(tmp_path / "check.png")[500:, 860:, :3]
+        white.append(np.flatnonzero((panel.min(axis=2) > 0.75).any(axis=1)))
+    # The first name is 370 pixels below the middle of the picture.
+    assert white[0].max() < 368 and white[1].max() < 368
+    assert len(white[0]) > len(white[1])
+
+
+def test_the_complexity_of_the_tumour_is_in_the_summary(patient):
+    """The tumour is a ball of 11 mm that protrudes half from the left kidney, towards the front and the head."""
+    rows = dict(summary_rows(patient))
+    assert rows["size"].startswith("2") and "exophytic" in rows["size"]
+    assert "R 1 (2" in rows["R.E.N.A.L."] and "N 1-3" in rows["R.E.N.A.L."] and "size 1" in rows["PADUA"]
+    assert "label the collecting system, renal sinus" in rows["not known"]
+    without = dict(summary_rows(replace(patient, parts={})))
+    assert not {"size", "R.E.N.A.L.", "PADUA", "not known"} & set(without)

@@ -1,0 +1,192 @@
+"""The page of a resection: the margin as a map on the specimen, and its figures; as PNG and JSON."""
+
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+from rehearsal.rehearsal import Rehearsal
+from rehearsal.resection.cut import Cut
+from rehearsal.resection.judgement import MARGIN_LIMITS_MM, Judgement
+from rehearsal.resection.resection_plan import ResectionPlan
+from rehearsal.resection.score_line import ResectionError
+from rehearsal.result_files import save_figure, write_json
+from scenes.surfaces import signed_distance_from
+
+NAME = "resection"
+# Colours of the margin: in the tumour, then up to each limit, then beyond the last.
+COLOURS = ("#7a0016", "#e5383b", "#f48c06", "#ffd60a", "#52b788")
+CAPSULE = "#c9b8ae"
+# Views of the specimen along the axes of the score's frame: title, direction from which it is seen, and what is up.
+VIEWS = (("resection surface, from below", (0, 0, -1), (0, 1, 0)), ("from the side", (0, -1, 0), (0, 0, 1)))
+TEXT_WIDTH = 40
+LIGHT = np.array([0.4, 0.6, 0.7])
+
+
+def report_of(rehearsal: Rehearsal, plan: ResectionPlan | None = None) -> dict[str, Any]:
+    """The figures of a cut, how it was made, and its comparison with a plan, for ``report.json``. Raises ResectionError without a cut."""
+    judgement, request = rehearsal.judgement, rehearsal.resection.cut
+    if judgement is None or request is None:
+        raise ResectionError("nothing was cut, or there is no tumour to judge by")
+    asked = request.settings
+    tumour = rehearsal.whole_tumour
+    seen = 0.0 if tumour is None else float(request.seen_of(len(tumour.vertices)).mean())
+    return dict(
+        technique=asked.technique,
+        margin_asked_mm=asked.margin_mm,
+        depth_mm=asked.depth_mm,
+        filling=asked.filling,
+        tumour_seen_percent=round(100 * seen, 1),
+        **judgement.report(),
+        **({} if plan is None else dict(against_plan=plan.compared(judgement))),
+    )
+
+
+def save_page(rehearsal: Rehearsal, report: dict[str, Any], out: Path) -> list[Path]:
+    """Write ``resection.png`` and ``resection.json`` with a report into a folder; return them. Raises ResectionError, OSError."""
+    cut, judgement = rehearsal.cut, rehearsal.judgement
+    if cut is None or judgement is None or rehearsal.whole_tumour is None:
+        raise ResectionError("nothing was cut, or there is no tumour to judge by")
+    figure = Figure(figsize=(13.5, 6.0), facecolor="white")
+    FigureCanvasAgg(figure)
+    faces = np.asarray(cut.specimen.vertices)[np.asarray(cut.specimen.faces)]
+    distance = signed_distance_from(rehearsal.whole_tumour, faces.mean(axis=1))
+    colours = _colours(distance, cut)
+    for place, (title, eye, up) in enumerate(VIEWS):
+        axes = figure.add_axes((0.01 + 0.3 * place, 0.14, 0.3, 0.76), projection="3d")
+        _draw_specimen(axes, faces @ _axes(cut, eye, up).T, colours, title)
+    _draw_histogram(figure.add_axes((0.67, 0.12, 0.31, 0.28)), judgement)
+    _draw_figures(figure, report)
+    _draw_legend(figure)
+    page, figures = out / f"{NAME}.png", out / f"{NAME}.json"
+    save_figure(figure, page, dpi=110)
+    write_json(report, figures)
+    return [page, figures]
+
+
+def _axes(cut: Cut, eye: tuple[int, int, int], up: tuple[int, int, int]) -> np.ndarray:
+    """Rows (3, 3): right, up, and towards the eye."""
+    frame, toward, above = cut.line.frame(), np.array(eye, float), np.array(up, float)
+    return np.stack([np.cross(above, toward), above, toward]) @ frame
+
+
+def _colours(distance_mm: np.ndarray, cut: Cut) -> np.ndarray:
+    """Colours (f, 3) of the specimen's faces: those of the margin, or of the capsule."""
+    of_margin = np.array([to_rgb(colour) for colour in COLOURS])
+    colours = of_margin[np.digitize(distance_mm, [0.0, *MARGIN_LIMITS_MM])]
+    colours[~cut.on_specimen] = to_rgb(CAPSULE)
+    return colours
+
+
+def _draw_specimen(axes: Any, faces: np.ndarray, colours: np.ndarray, title: str) -> None:
+    """Draw faces (f, 3, 3) in the axes right, up, towards the eye."""
+    normal = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    bright = 0.72 + 0.28 * np.clip(normal @ (LIGHT / np.linalg.norm(LIGHT)), 0, 1)
+    seen = normal[:, 2] > 0
+    # Matplotlib's axes are x to the right, z up, and y away from the eye.
+    placed = np.stack([faces[..., 0], -faces[..., 2], faces[..., 1]], axis=-1)[seen]
+    shaded = (colours * bright[:, None])[seen]
+    axes.add_collection3d(Poly3DCollection(placed, facecolors=shaded, edgecolors=shaded, linewidths=0.4))
+    low, high = placed.min(axis=(0, 1)), placed.max(axis=(0, 1))
+    half, middle = (high - low).max() / 2, (high + low) / 2
+    axes.set(**{f"{name}lim": (m - half, m + half) for name, m in zip("xyz", middle, strict=True)})
+    axes.set_box_aspect((1, 1, 1), zoom=1.45)
+    axes.set_proj_type("ortho")
+    axes.view_init(elev=0, azim=-90)
+    axes.set_axis_off()
+    axes.set_title(title, fontsize=12)
+
+
+def _draw_histogram(axes: Axes, judgement: Judgement) -> None:
+    """Draw the area of the resection surface by its margin."""
+    margin, area = judgement.margin.distance_mm, judgement.margin.area_mm2
+    last = max(MARGIN_LIMITS_MM[-1] + 2, np.ceil(margin.max()))
+    edges = np.arange(np.floor(min(margin.min(), 0.0)), last + 0.5, 0.5)
+    area_of = np.histogram(margin, edges, weights=area)[0]
+    colours = [
+        COLOURS[number] for number in np.digitize((edges[:-1] + edges[1:]) / 2, [0.0, *MARGIN_LIMITS_MM])
+    ]
+    axes.bar(edges[:-1], area_of / 100, width=0.5, align="edge", color=colours)
+    axes.set(xlabel="margin, mm (below 0: in the tumour)", ylabel="area, cm2")
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
+def _draw_legend(figure: Figure) -> None:
+    names = [
+        "in the tumour",
+        *(f"below {limit:g} mm" for limit in MARGIN_LIMITS_MM),
+        f"{MARGIN_LIMITS_MM[-1]:g} mm and more",
+    ]
+    patches = [
+        Patch(color=colour, label=name)
+        for colour, name in zip((*COLOURS, CAPSULE), (*names, "capsule"), strict=True)
+    ]
+    figure.legend(
+        handles=patches, loc="lower left", bbox_to_anchor=(0.03, 0.02), ncol=6, frameon=False, fontsize=10
+    )
+
+
+def _draw_figures(figure: Figure, report: dict[str, Any]) -> None:
+    rows = rows_of(report)
+    figure.text(0.03, 0.93, "Resection", fontsize=17, weight="bold")
+    height = 0.93
+    for name, value in rows:
+        figure.text(0.62, height, name, fontsize=10.5, color="#555555", va="top")
+        lines = textwrap.wrap(value, TEXT_WIDTH)
+        figure.text(0.755, height, "\n".join(lines), fontsize=10.5, va="top")
+        height -= 0.038 * len(lines)
+
+
+def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
+    """Names and values of a report, for the page and the terminal."""
+    depth = "as deep as seen" if report["depth_mm"] is None else f"{report['depth_mm']:g} mm deep"
+    vessels = [f"{each['tissue']} {each['diameter_mm']:.1f} mm" for each in report["vessels"]]
+    shown = ", ".join(vessels[:3]) + (f" and {len(vessels) - 3} more" if len(vessels) > 3 else "")
+    below = ", ".join(f"{report[f'margin_below_{limit:g}_mm2']:.0f}" for limit in MARGIN_LIMITS_MM)
+    limits = ", ".join(f"{limit:g}" for limit in MARGIN_LIMITS_MM)
+    plan = report.get("against_plan")
+    against = (
+        []
+        if plan is None
+        else [
+            (
+                "against the plan",
+                f"{plan['cost_ml']:.1f} ml, planned {plan['planned_cost_ml']:.1f} ml by {plan['planned_technique']}",
+            )
+        ]
+    )
+    return [
+        ("technique", f"{report['technique']}, {depth}; {report['filling']} in the crater"),
+        ("tumour seen", f"{report['tumour_seen_percent']:.0f} % of its surface"),
+        (
+            "margin",
+            f"{report['margin_min_mm']:.1f} mm least, {report['margin_mean_mm']:.1f} mm mean; asked {report['margin_asked_mm']:g}",
+        ),
+        (
+            "in the tissue as cut",
+            f"{report['margin_min_as_cut_mm']:.1f} mm least, {report['margin_mean_as_cut_mm']:.1f} mm mean",
+        ),
+        (f"area below {limits} mm", f"{below} mm2"),
+        (
+            "positive margin",
+            f"{report['positive_margin_mm2']:.0f} mm2; tumour left {report['tumour_left_ml']:.2f} ml",
+        ),
+        ("specimen", f"{report['specimen_ml']:.1f} ml"),
+        (
+            "parenchyma removed",
+            f"{report['parenchyma_removed_ml']:.1f} ml, {report['parenchyma_removed_percent']:.1f} % of the kidney",
+        ),
+        ("collecting system", f"{report['collecting_system_opened_mm2']:.0f} mm2 opened"),
+        ("vessels cut", shown or "none"),
+        ("bed", f"{report['bed_mm2'] / 100:.1f} cm2"),
+        *against,
+    ]

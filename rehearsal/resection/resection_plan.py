@@ -1,0 +1,117 @@
+"""The file of a planned resection: proposals, the best first, with their figures. JSON; patient coordinates LPS, mm."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
+
+from errors import UserError
+from rehearsal.resection.judgement import Judgement
+from rehearsal.resection.proposal import Proposal, cost_ml
+from rehearsal.resection.script import Number
+from render.viewer import Technique
+from scenes.atomic_files import atomic_write
+
+# The first bytes of a plan contain this.
+MARK = b'"nephron_resection"'
+Place = tuple[Number, Number, Number]
+
+
+class ResectionPlanError(UserError):
+    """A plan of a resection that cannot be used; the message is one line."""
+
+
+class _FileModel(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class PlannedCut(_FileModel):
+    """A technique and a closed line on the capsule at rest; ``cost_ml`` see ``proposal.cost_ml``, ``figures`` those of ``Judgement.report``."""
+
+    technique: Technique
+    cost_ml: float
+    direction: Place
+    marks_mm: Annotated[list[Place], Field(min_length=3, max_length=200)]
+    line_mm: Annotated[list[Place], Field(min_length=3, max_length=10_000)]
+    figures: dict[str, JsonValue]
+
+
+class ResectionPlan(_FileModel):
+    """``version`` is the Nephron that made it, ``anatomy`` the fingerprint of the patient's files."""
+
+    nephron_resection: Literal[1] = 1
+    version: str | None = None
+    anatomy: str
+    margin_mm: float = Field(ge=0, le=30)
+    cuts: list[PlannedCut] = Field(min_length=1)
+
+    @property
+    def best(self) -> PlannedCut:
+        """The first of the cuts."""
+        return self.cuts[0]
+
+    def compared(self, judgement: Judgement) -> dict[str, Any]:
+        """A rehearsed cut against the best planned one: what both cost, and how much more the rehearsed one took away."""
+        planned, figures, made = self.best, self.best.figures, judgement.report()
+        more = (
+            "parenchyma_removed_ml",
+            "collecting_system_opened_mm2",
+            "margin_min_mm",
+            "positive_margin_mm2",
+        )
+        return dict(
+            planned_technique=planned.technique,
+            planned_cost_ml=round(planned.cost_ml, 2),
+            cost_ml=round(cost_ml(judgement, self.margin_mm), 2),
+            **{f"{name}_more": round(made[name] - float(figures[name]), 3) for name in more},  # type: ignore[arg-type]
+        )
+
+
+def planned_cut(proposal: Proposal, origin: np.ndarray) -> PlannedCut:
+    """A proposal as a file has it; ``origin`` (3,) [mm] is where its coordinates are zero in the patient."""
+
+    def places(points: np.ndarray) -> list[Place]:
+        return [(x, y, z) for x, y, z in np.round(points + origin, 3).tolist()]
+
+    x, y, z = np.round(proposal.line.direction, 4).tolist()
+    return PlannedCut(
+        technique=proposal.settings.technique,
+        cost_ml=round(proposal.cost_ml, 3),
+        direction=(x, y, z),
+        marks_mm=places(proposal.line.marks),
+        line_mm=places(proposal.line.points),
+        figures=proposal.judgement.report(),
+    )
+
+
+def write_resection_plan(plan: ResectionPlan, path: Path) -> None:
+    """Write a plan; the same plan gives the same bytes. Raises OSError."""
+    with atomic_write(path) as partial:
+        partial.write_text(json.dumps(plan.model_dump(mode="json"), indent=1) + "\n", "utf-8")
+
+
+def is_resection_plan(path: Path) -> bool:
+    """Whether a file begins as a plan of a resection does."""
+    try:
+        return MARK in path.read_bytes()[:100]
+    except OSError:
+        return False
+
+
+def read_resection_plan(path: Path) -> ResectionPlan:
+    """Read a plan. Raises ResectionPlanError."""
+    try:
+        return ResectionPlan.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise ResectionPlanError(
+            f"{path}: cannot be read as a plan of a resection ({error.strerror})"
+        ) from None
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise ResectionPlanError(
+            f"{path}: not a plan of a resection{f', {where}' if where else ''}: {first['msg'].lower()}; expected a file that app.py plan "
+            "--resect wrote"
+        ) from None

@@ -1,0 +1,95 @@
+"""What the window shows of a resection: the score, the resection surface that a cut would have now, and their figures."""
+
+import numpy as np
+
+from rehearsal.rehearsal import Rehearsal
+from rehearsal.resection.cut import Cut, CutSettings, cut_organ
+from rehearsal.resection.operation import IsSeen, distance_to_tumour
+from rehearsal.resection.resection_plan import ResectionPlan
+from rehearsal.resection.score_line import ResectionError
+from render.viewer import Score, Settings
+from sim.fields import array_of
+from sim.skinning import Skin
+from ultrasound.crater import Filling
+from ultrasound.scanner import plane_section
+
+# A line that is nearer to the tumour than the margin by no more than this is not warned of.
+TOLERANCE_MM = 0.5
+
+
+def cut_settings(settings: Settings) -> CutSettings:
+    """How the sliders say that the next cut is made."""
+    depth_mm = float(settings.cut_depth_mm) or None
+    filling: Filling = "air" if settings.air_in_crater else "fluid"
+    return CutSettings(settings.technique, float(settings.margin_mm), depth_mm, filling)
+
+
+class ResectionView:
+    """The score and the coming resection surface of a rehearsal.
+
+    ``plan`` is what is to be followed, if anything. ``fault`` says why a cut is not possible now; ``tumour_mm`` (k,) are the distances of the score's points from the tumour's outline.
+    """
+
+    def __init__(self, rehearsal: Rehearsal, plan: ResectionPlan | None = None) -> None:
+        self.rehearsal, self.plan = rehearsal, plan
+        self._plan_skin: Skin | None = None
+        if plan is not None:
+            line = np.array(plan.best.line_mm) - rehearsal.origin
+            self._plan_skin = Skin(rehearsal.model, line)
+        self.fault = ""
+        self.tumour_mm = np.zeros(0)
+        self._planned: Cut | None = None
+        self._skin: Skin | None = None
+        self._of: tuple[object, ...] = ()
+
+    def update(self, settings: CutSettings, is_seen: IsSeen) -> None:
+        """Follow the marks, the settings, and what the images have shown of the tumour."""
+        resection, tumour = self.rehearsal.resection, self.rehearsal.whole_tumour
+        if not resection.marks and not self._of:
+            return
+        points = np.zeros((0, 3)) if tumour is None else np.asarray(tumour.vertices)
+        seen = is_seen(points)
+        of = resection.marks, resection.cut is None, settings, seen.tobytes()
+        if of == self._of:
+            return
+        self._of = of
+        self.fault, self._planned, self._skin = self.rehearsal.score_fault, None, None
+        self.tumour_mm = distance_to_tumour(self.rehearsal)
+        line = self.rehearsal.score
+        if line is None or resection.cut is not None:
+            return
+        try:
+            self._planned = cut_organ(self.rehearsal.whole_organ, line, settings, points[seen])
+            self._skin = Skin(self.rehearsal.model, self._planned.specimen.vertices)
+        except ResectionError as error:
+            self.fault = str(error)
+
+    def section(self, plane_from_world: np.ndarray) -> np.ndarray | None:
+        """The coming resection surface on an image plane: segments (n, 2, 2) [mm]; None without one."""
+        if self._planned is None or self._skin is None:
+            return None
+        self._skin.update()
+        faces = np.asarray(self._planned.specimen.faces)[self._planned.on_specimen]
+        return plane_section(array_of(self._skin.vertices).astype(float), faces, plane_from_world)
+
+    def score(self, margin_mm: float) -> Score | None:
+        """The score and the planned one as they lie now, None without either; a part is near where its margin is smaller than asked."""
+        if not self.rehearsal.resection.marks and self._plan_skin is None:
+            return None
+        planned = np.zeros((0, 3))
+        if self._plan_skin is not None and self.rehearsal.cut is None:
+            self._plan_skin.update()
+            planned = array_of(self._plan_skin.vertices).astype(float)
+        line, marks = self.rehearsal.score_points()
+        near = self.tumour_mm < margin_mm - TOLERANCE_MM if len(self.tumour_mm) else np.zeros(len(line), bool)
+        return Score(line, marks, near, planned)
+
+    def status(self, settings: CutSettings) -> str:
+        """The text over the images while scoring; empty before the first mark and after the cut."""
+        count = len(self.rehearsal.resection.marks)
+        if count == 0 or self.rehearsal.cut is not None:
+            return ""
+        parts = [f"SCORE {count} marks", settings.technique]
+        if len(self.tumour_mm) and self.tumour_mm.min() < settings.margin_mm - TOLERANCE_MM:
+            parts.append(f"{self.tumour_mm.min():.1f} of {settings.margin_mm:.0f} mm margin")
+        return "   ".join(parts)
