@@ -8,7 +8,6 @@ import trimesh
 from cut_ball import HEIGHT_MM, MARKS, RIM_MM, R, ball, cap_mm3, circle, inset, line_on_ball
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial import ConvexHull
 
 from rehearsal.resection.cut import (
     STEEPEST,
@@ -16,7 +15,7 @@ from rehearsal.resection.cut import (
     cut_organ,
     faces_of,
     grown,
-    part_outside,
+    part_left,
 )
 from rehearsal.resection.score_line import ResectionError, score_line
 
@@ -206,13 +205,21 @@ def test_a_cut_of_most_of_the_organ_is_refused():
 def test_a_part_loses_what_is_in_the_specimen():
     made = cut(CutSettings("wedge", depth_mm=12.0))
     part = ball(6.0, (0.0, 0.0, HEIGHT_MM - 8.0))
-    left = part_outside(part, made)
-    inside = ConvexHull(np.vstack([part.vertices]))
-    assert left.is_watertight and 0 < left.volume < inside.volume
-    assert part_outside(part, None) is part
-    assert part_outside(ball(2.0, (0.0, 0.0, HEIGHT_MM)), made) is None
+    left = part_left(part, made)
+    taken = trimesh.boolean.intersection([part, made.specimen]).volume
+    assert taken > 100 and left.volume == pytest.approx(part.volume - taken, rel=1e-6)
+    assert part_left(part, None) is part
+    assert part_left(ball(2.0, (0.0, 0.0, HEIGHT_MM)), made) is None
     away = ball(4.0, (0.0, 0.0, -15.0))
-    assert part_outside(away, made).volume == pytest.approx(away.volume, rel=1e-9)
+    assert part_left(away, made).volume == pytest.approx(away.volume, rel=1e-9)
+
+
+def test_what_is_outside_of_the_organ_stays_unless_the_part_is_within_it():
+    made = cut(CutSettings("wedge", depth_mm=12.0))
+    vessel = ball(5.0, (R, 0.0, 0.0))
+    outside = trimesh.boolean.difference([vessel, ORGAN]).volume
+    assert part_left(vessel, made).volume == pytest.approx(vessel.volume, rel=1e-9)
+    assert part_left(vessel, made, is_within=True).volume == pytest.approx(vessel.volume - outside, rel=1e-6)
 
 
 def test_a_piece_next_to_nothing_that_rounding_leaves_is_in_neither():

@@ -41,7 +41,7 @@ def tissue_of(cut: Cut) -> RemovedTissue:
 
 
 @pytest.fixture(scope="module", params=CUTTERS)
-def tissue(request) -> RemovedTissue:
+def tissue(request, one_device) -> RemovedTissue:
     return tissue_of(cut_by(ORGAN, CUTTERS[request.param]))
 
 
@@ -177,6 +177,20 @@ def test_more_points_than_needed_have_no_area_and_fewer_are_farther_apart():
     assert left[gone].sum() == pytest.approx(deep.new_surface().area, rel=1e-9)
 
 
+@pytest.mark.parametrize("radius", [0.9, 0.3])
+def test_a_hole_with_more_sides_than_it_takes_points_keeps_its_area(one_device, radius):
+    """Its walls face six directions, and its mouth takes three points of the capsule or none: as many stay."""
+    hole = trimesh.creation.box([2 * radius, 2 * radius, 40.0]).apply_translation([0.3, 0.4, 28.0])
+    narrow = tissue_of(cut_by(ORGAN, hole))
+    points, area = surface_points(ORGAN, CELL_MM / 2)
+    gone = narrow.is_removed(points)
+    assert gone.sum() < 5
+    moved, left = points_without(points, area, narrow, CELL_MM / 2)
+    assert moved.shape == points.shape and np.isfinite(moved).all()
+    assert left[gone].sum() == pytest.approx(narrow.new_surface().area if gone.any() else 0.0, rel=1e-9)
+    np.testing.assert_array_equal(left[~gone], area[~gone])
+
+
 def test_points_are_removed_by_the_surface_that_is_nearer(tissue):
     inside = np.array([[0.0, 0.0, R], [0.0, 0.0, -R], [R, 0.0, 0.0]])
     assert tissue.is_removed(inside).tolist() == [True, False, False]
@@ -277,7 +291,7 @@ def test_the_steps_after_undo_and_redo_give_the_same_bits(patient):
     assert stepped() == of_whole
 
 
-def test_the_corners_share_is_the_shape_function_at_the_centre_of_the_tissue():
+def test_the_corners_share_is_the_shape_function_at_the_centre_of_the_tissue(one_device):
     """Below the plane z = 11 a cell between 10.x and 14.x keeps its lower part: its centre is amid that part."""
     cut = tissue_of(cut_by(ORGAN, CUTTERS["plane"]))
     lattice = lattice_without(WHOLE, cut, [PART])
