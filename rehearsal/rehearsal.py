@@ -18,7 +18,8 @@ from rehearsal.resection.resection_state import NO_RESECTION, Resection
 from rehearsal.resection.score_line import LEAST_MARKS, ResectionError, ScoreLine, score_line
 from scenes.anatomy import Grid, LoadedAnatomy
 from scenes.scene import Scene
-from scenes.surfaces import signed_distance_from, translated, volume_mm3
+from scenes.solids import solid_of
+from scenes.surfaces import translated, volume_mm3
 from scenes.terminal import ReportProgress, no_progress
 from sim.embedding import Embedding
 from sim.fields import array_of
@@ -43,6 +44,8 @@ SUPPORT_SUNK_MM = 0.4
 SURROUNDINGS_MM = 25.0
 # Points along each side of an image whose rest positions are computed.
 REST_PLACES = 48
+# Largest share of the tissue that the hilum's vessels hold that a cut may remove.
+MOST_OF_HILUM = 0.25
 # Gap between the organ and the specimen beside it.
 BESIDE_MM = 8.0
 # Cuts of this many states are kept, for undo and redo.
@@ -224,11 +227,17 @@ class Rehearsal(PressedOrgan):
         return self._cuts[resection]
 
     def _check_hilum(self, cut: Cut) -> None:
-        """Raises ResectionError where the specimen would contain the hilum."""
-        hilum = self.scene.attachment.at_mm
-        if hilum is not None and signed_distance_from(cut.specimen, np.array([hilum]) - self.origin)[0] < 0:
+        """Raises ResectionError where the specimen would contain much of the tissue around the hilum."""
+        place, radius_mm = self.scene.attachment.at_mm, self.scene.attachment.radius_mm
+        if place is None or radius_mm == 0:
+            return
+        ball = trimesh.creation.icosphere(radius=radius_mm)
+        around = solid_of(translated(ball, np.array(place) - self.origin), "hilum")
+        volumes = [(solid_of(each, "organ") ^ around).volume() for each in (cut.specimen, self.whole_organ)]
+        if volumes[0] > MOST_OF_HILUM * volumes[1]:
             raise ResectionError(
-                "the cut goes through the hilum, with the kidney's vessels; set the score nearer to the tumour"
+                f"the cut removes {volumes[0] / volumes[1]:.0%} of the tissue around the hilum, where the kidney's vessels enter; set the "
+                "score nearer to the tumour"
             )
 
     def apply_cut(self, cut: Cut | None) -> None:

@@ -60,7 +60,7 @@ class _FilePose(BaseModel):
     name: str = Field("", max_length=40, pattern=r"^[A-Za-z0-9_-]*$")
     time_s: float | None = None
     probe_to_patient: Pose
-    score: Literal["image"] | list[Place] | None = None
+    score: Literal["image"] | Annotated[list[Place], Field(min_length=1)] | None = None
     """Set marks of the score: at the edges of tumour and margin in the image, or at these places (LPS, mm)."""
     margin_mm: float = Field(5.0, ge=0, le=20)
     cut: ScriptedCut | None = None

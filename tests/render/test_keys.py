@@ -131,6 +131,14 @@ def test_a_file_changes_behaviour_help_and_words(tmp_path):
 def test_every_usual_key_is_a_key_and_there_once():
     assert set(DEFAULT_KEYS.values()) <= set(KEYS) and len(set(DEFAULT_KEYS.values())) == len(DEFAULT_KEYS)
     assert [Keys().action_of(KEYS[key]) for key in DEFAULT_KEYS.values()] == list(DEFAULT_KEYS)
+    # With shift a key that has no action of its own with it has its usual one.
+    assert [Keys().action_of(key, with_shift=True) for key in ("x", "m", "w", "F1")] == [
+        "cut_out",
+        "score_image",
+        "push",
+        "",
+    ]
+    assert [Keys().action_of(key) for key in ("x", "m")] == ["cut", "bookmark"]
     assert len(set(KEYS.values())) == len(KEYS)
 
 

@@ -1,5 +1,6 @@
 """A real window under Xvfb, its mouse moved by xdotool: what the surgeon does is what happens."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -26,6 +27,7 @@ SCREEN, WINDOW = "640x480x24", (640, 360)
 PANEL, SCENE = np.s_[70:310, 400:620], np.s_[40:240, 10:360]
 STILL = 0.5
 # Two points on the B-mode image beside the CT.
+MARKS = ((200, 130), (290, 130), (245, 165))
 B_MODE_TOP, B_MODE_FOOT = (460, 90), (460, 230)
 
 
@@ -173,5 +175,18 @@ def test_the_mouse_moves_and_presses_the_transducer(screen):
     while not exported.exists() and time.monotonic() < end:
         time.sleep(0.5)
     assert exported.exists() and (screen.out / "001-ct.png").exists()
+    screen.do("keydown", "Shift_L")
+    for place in MARKS:
+        screen.point(*place)
+        time.sleep(0.5)
+        screen.do("mousedown", 1)
+        time.sleep(0.5)
+        screen.do("mouseup", 1)
+    screen.do("keyup", "Shift_L")
+    screen.picture()
     screen.do("key", "--window", screen.window, "Escape")
     assert screen.program.wait(timeout=20) == 0
+    lines = (screen.out / "session-001.jsonl").read_text().splitlines()
+    events = [event for line in lines for event in json.loads(line).get("events", [])]
+    marks = [event["value"] for event in events if event["kind"] == "marks"]
+    assert [len(each) for each in marks] == [1, 2, 3], "a click with shift sets no mark"
