@@ -21,7 +21,7 @@ from sim.solver import StepSettings
 from studies.accuracy.bead_case import BeadCase, load_case
 from studies.accuracy.bead_errors import bead_errors, null_errors
 from studies.accuracy.bead_experiment import BeadExperiment
-from studies.resection.cut_lines import line_around
+from studies.resection.cut_lines import line_over
 from ultrasound.probe_manipulator import poses_between
 
 UNCUT = Path(__file__).parents[1] / "reference" / "embedded"
@@ -166,5 +166,5 @@ def embedded_anatomy() -> LoadedAnatomy:
 def embedded_cut(anatomy: LoadedAnatomy) -> Cut:
     """The cut of the embedded patient: enucleoresection with a margin of 3 mm."""
     assert anatomy.tumour is not None
-    line = line_around(anatomy.organ, anatomy.tumour, SETTINGS.margin_mm)
+    line = line_over(anatomy.organ, anatomy.tumour, SETTINGS.margin_mm)
     return cut_organ(anatomy.organ, line, SETTINGS, np.asarray(anatomy.tumour.vertices))

@@ -8,14 +8,12 @@ import numpy as np
 import trimesh
 
 from rehearsal.resection.cut import Cut, CutSettings, cut_organ
-from rehearsal.resection.proposal import marks_around
+from rehearsal.resection.proposal import line_around
 from rehearsal.resection.score_line import ScoreLine, places_on, score_line
 from render.viewer import Technique
 
 TECHNIQUES: tuple[Technique, ...] = get_args(Technique)
 MARGINS_MM = (0.0, 3.0, 5.0)
-# A line's direction is that of the marks that are proposed along it, after so many rounds.
-ROUNDS = 5
 # Badly placed lines: beside the tumour by this, drawn in to this share of the width, and a cut to this depth.
 BESIDE_MM, DRAWN_IN, SHALLOW_MM = 10.0, 0.6, 12.0
 
@@ -31,7 +29,7 @@ class PlannedCut:
 
 def planned_cuts(organ: trimesh.Trimesh, tumour: trimesh.Trimesh) -> Iterator[PlannedCut]:
     """All techniques and margins along lines around tumour and margin, then badly placed cuts that leave tumour. Raises ResectionError."""
-    lines = {margin: line_around(organ, tumour, margin) for margin in MARGINS_MM}
+    lines = {margin: line_over(organ, tumour, margin) for margin in MARGINS_MM}
     points = np.asarray(tumour.vertices)
     for technique in TECHNIQUES:
         for margin, line in lines.items():
@@ -41,15 +39,11 @@ def planned_cuts(organ: trimesh.Trimesh, tumour: trimesh.Trimesh) -> Iterator[Pl
         yield PlannedCut(placed, settings, cut_organ(organ, line, settings, points))
 
 
-def line_around(organ: trimesh.Trimesh, tumour: trimesh.Trimesh, margin_mm: float) -> ScoreLine:
-    """The line around a tumour and a margin, seen along its own direction. Raises ResectionError."""
+def line_over(organ: trimesh.Trimesh, tumour: trimesh.Trimesh, margin_mm: float) -> ScoreLine:
+    """The line around a tumour and a margin where the tumour is nearest to the organ's surface. Raises ResectionError."""
     middle = np.asarray(tumour.center_mass)
     direction = places_on(organ, middle)[0][0] - middle
-    direction /= np.linalg.norm(direction)
-    for _ in range(ROUNDS):
-        line = score_line(organ, marks_around(organ, tumour, margin_mm, direction))
-        direction = line.direction
-    return line
+    return line_around(organ, tumour, margin_mm, direction / np.linalg.norm(direction))
 
 
 def _badly_placed(organ: trimesh.Trimesh, line: ScoreLine) -> Iterator[tuple[str, ScoreLine, CutSettings]]:

@@ -13,7 +13,7 @@ from rehearsal.resection.proposal import marks_around
 from rehearsal.resection.resection_state import NO_RESECTION, CutRequest, Resection
 from rehearsal.resection.score_line import score_line
 from rehearsal.stopwatch import timed
-from studies.resection.cut_lines import line_around
+from studies.resection.cut_lines import line_over
 from ultrasound.crater import Crater
 
 REPEATS = 7
@@ -61,7 +61,7 @@ def _resections(rehearsal: Rehearsal, margin_mm: float) -> tuple[Resection, Rese
     """The score around the tumour, and with the cut."""
     organ, tumour = rehearsal.whole_organ, rehearsal.whole_tumour
     assert tumour is not None
-    line = line_around(organ, tumour, margin_mm)
+    line = line_over(organ, tumour, margin_mm)
     marked = NO_RESECTION.with_marks(marks_around(organ, tumour, margin_mm, line.direction))
     settings = CutSettings("enucleoresection", margin_mm)
     seen = np.ones(len(tumour.vertices), bool)

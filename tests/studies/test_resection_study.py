@@ -13,7 +13,7 @@ import app
 from rehearsal.resection.cut import CutSettings
 from studies.resection import resection_command
 from studies.resection.cut_balance import BalanceRow
-from studies.resection.cut_lines import line_around
+from studies.resection.cut_lines import line_over
 from studies.resection.margin_rows import MarginRow, margin_rows
 from studies.resection.random_cuts import RandomResult, summary, surface_faults
 from studies.resection.random_scores import KINDS, ScoredPatient, random_score
@@ -99,7 +99,7 @@ def test_a_patient_without_a_tumour_has_no_margins():
 
 
 def test_the_line_around_a_tumour_is_seen_along_its_own_direction():
-    line = line_around(ORGAN, ball(7.0, (0.0, 12.0, 18.0)), 3.0)
+    line = line_over(ORGAN, ball(7.0, (0.0, 12.0, 18.0)), 3.0)
     out = np.array([0.0, 12.0, 18.0]) / np.hypot(12, 18)
     assert line.direction @ out > 0.995
 
