@@ -7,15 +7,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
+from coarse_patient import coarse_patient
 from cut_ball import R, ball, cap_mm3, cut_by, half_space
+from small_bead_case import write_case
 
 import app
+from rehearsal.configuration import setup_of
 from rehearsal.resection.cut import CutSettings
+from sim.removed_tissue import RemovedTissue
+from studies.accuracy.bead_case import load_case
+from studies.harness import positions_of
 from studies.resection import resection_command
-from studies.resection.cut_balance import BalanceRow
+from studies.resection.cut_balance import BalanceRow, CutBeadExperiment, CutCase
 from studies.resection.cut_lines import line_over
 from studies.resection.margin_rows import MarginRow, margin_rows
-from studies.resection.random_cuts import RandomResult, summary, surface_faults
+from studies.resection.random_cuts import RandomResult, random_results, summary, surface_faults
 from studies.resection.random_scores import KINDS, ScoredPatient, random_score
 from studies.resection.voxel_margins import VOXEL_MM, CutFigures, figures_by_voxels, signed_distance_map
 from studies.resection.voxel_solid import RasterGrid
@@ -145,6 +151,40 @@ def test_the_summary_counts_reasons_without_their_numbers_and_lists_failures():
     assert lines[0] == "4 random scores: 2 cut, 2 refused, 1 failed"
     assert lines[1].strip() == "2 refused: the cut removes only N ml"
     assert "q, seed 4 (half): the remnant is not closed" in lines[2] and len(lines) == 3
+
+
+def test_random_cuts_of_a_patient_are_refused_or_without_fault(device, monkeypatch):
+    rehearsal = coarse_patient()[0]
+    seeds = [0, 1, 3]
+    found = list(random_results("p", rehearsal, seeds))
+    assert [each.seed for each in found] == seeds and not any(each.faults for each in found)
+    assert {bool(each.refused) for each in found} == {True, False}
+    made = next(each for each in found if not each.refused)
+    assert made.specimen_ml > 0.1 and abs(made.volume_change_percent) < 0.5
+    # What is wrong is seen, and an error of the program is one of its faults.
+    monkeypatch.setattr("studies.resection.random_cuts.VOLUME_BAR", -1.0)
+    (again,) = random_results("p", rehearsal, [made.seed])
+    assert any("of the organ's volume" in fault for fault in again.faults)
+    monkeypatch.setattr(rehearsal, "advance", lambda pose: 1 / 0)
+    (broken,) = random_results("p", rehearsal, [made.seed])
+    assert broken.faults == ("ZeroDivisionError: division by zero",)
+
+
+def test_tissue_is_removed_before_or_after_the_organ_settles(device, tmp_path):
+    case = load_case(write_case(tmp_path))
+    cut = cut_by(case.organ, half_space(8.0))
+    removed = CutCase(case, RemovedTissue(cut.specimen, cut.remnant, cut.on_remnant))
+    setup = setup_of("neo-hookean", cell_mm=4.0, warm_up_steps=30, stage_steps=6)
+    rests = []
+    for settles_first in (False, True):
+        experiment = CutBeadExperiment(removed, setup, settles_first)
+        whole = experiment.model.lattice.tissue.sum()
+        experiment.prepare(setup)
+        left = experiment.model.lattice.tissue.sum()
+        assert left / whole == pytest.approx(cut.remnant.volume / case.organ.volume, rel=0.02)
+        rests.append(positions_of(experiment.solver)[:, 2].mean())
+    # The same tissue at rest in the same bowl, but for friction: less than the sag of the whole.
+    assert rests[0] == pytest.approx(rests[1], abs=0.3)
 
 
 def test_balance_is_within_only_if_each_stage_is():
