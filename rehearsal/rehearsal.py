@@ -179,9 +179,10 @@ class Rehearsal(PressedOrgan):
 
     def restore(self, state: RehearsalState) -> None:
         """Restore a state; the steps that follow give the same bits as before."""
+        # First the tissue that is there: contact points that the cut moves lose their friction, which the state then restores.
+        self.set_resection(state.resection)
         self.restore_organ(state)
         self.manipulator.state = state.manipulator
-        self.set_resection(state.resection)
 
     def set_resection(self, resection: Resection) -> None:
         """Have these marks of the score and this cut. Raises ResectionError, before anything has changed."""

@@ -281,13 +281,18 @@ def faces_by_patch(
 
 
 def _small_faces(surface: trimesh.Trimesh, longest_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Middles (f, 3) [mm], areas (f,) [mm^2] and unit normals (f, 3) of a surface's faces, divided until no edge is longer."""
+    """Middles (f, 3) [mm], areas (f,) [mm^2] and unit normals (f, 3) of a surface's faces, divided until no edge is longer.
+
+    Faces without area, which a cut can leave, are left out.
+    """
     vertices, faces = trimesh.remesh.subdivide_to_size(
         surface.vertices, surface.faces, longest_mm, max_iter=30
     )
     corner = vertices[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
+    has_area = length[:, 0] > 0
+    corner, normal, length = corner[has_area], normal[has_area], length[has_area]
     return corner.mean(axis=1), length[:, 0] / 2, normal / np.maximum(length, 1e-30)
 
 

@@ -131,16 +131,24 @@ def points_without(
     Where that needs fewer points, the rest have no area.
     """
     gone = np.flatnonzero(tissue.is_removed(points))
-    new, new_area = surface_points(tissue.new_surface(), spacing_mm)
-    while len(new) > len(gone):
-        spacing_mm *= COARSER
-        new, new_area = surface_points(tissue.new_surface(), spacing_mm)
+    new, new_area = _few_points(tissue.new_surface(), spacing_mm, len(gone))
     points, area_mm2 = points.copy(), area_mm2.copy()
     area_mm2[gone] = 0.0
     if len(new):
         points[gone] = new[np.arange(len(gone)) % len(new)]
         area_mm2[gone[: len(new)]] = new_area
     return points, area_mm2
+
+
+def _few_points(surface: trimesh.Trimesh, spacing_mm: float, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """At most so many points (k, 3) [mm] on a surface, a spacing apart or more, and their areas (k,) [mm^2], which sum to the surface's."""
+    points, area = surface_points(surface, spacing_mm)
+    while len(points) > most and spacing_mm < surface.extents.max():
+        spacing_mm *= COARSER
+        points, area = surface_points(surface, spacing_mm)
+    # Sides that face different directions have points of their own, however far apart points are: the largest stand for all.
+    largest = np.sort(np.argsort(-area, kind="stable")[:most])
+    return points[largest], area[largest] * (area.sum() / area[largest].sum() if most else 0.0)
 
 
 def patch_shares(organ: trimesh.Trimesh, lattice: Lattice, tissue: RemovedTissue) -> np.ndarray:

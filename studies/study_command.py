@@ -41,6 +41,10 @@ STUDIES = {
         "studies.echo.echo_command:echo",
         "Compare the B-mode image with an independent wave simulator.",
     ),
+    "resection": (
+        "studies.resection.resection_command:resection",
+        "Measure margins, balance, random cuts and times of the resection.",
+    ),
     "plan": (
         "studies.planning.plan_comparison:plan_study",
         "Compare planned sweeps with straight and random ones.",

@@ -16,7 +16,7 @@ import manifold3d
 import numpy as np
 import trimesh
 
-from rehearsal.resection.score_line import ResectionError, ScoreLine
+from rehearsal.resection.score_line import ResectionError, ScoreLine, places_on
 from render.viewer import Technique
 from scenes.solids import solid_of, surface_of
 from ultrasound.crater import Filling
@@ -30,6 +30,8 @@ FLOOR_SHARE = 0.5
 LEAST_SPECIMEN_ML, MOST_OF_ORGAN = 0.1, 0.5
 # Volume of tissue that is cut off in another place and so stays, from which it is worth a warning.
 LEAST_STAYING_ML = 0.05
+# Pieces of less volume are rounding: flat, of some 1e-14 [mm^3].
+LEAST_PIECE_MM3 = 1e-6
 # Less of a part is within the error of its surface [mm^3].
 LEAST_LEFT_MM3 = 1.0
 # A wedge is at most so many times as deep as the tumour and the margin.
@@ -76,24 +78,33 @@ def cut_organ(
     cutter = _cutter(organ, line, settings, tumour_points).as_original()
     inner, outer = whole ^ cutter, whole - cutter
     _check_size(inner.volume(), organ.volume)
-    pieces = sorted(inner.decompose(), key=lambda piece: -piece.volume())
+    pieces = sorted(_pieces(inner), key=lambda piece: _distance_mm(piece, line))
     staying_ml = sum(piece.volume() for piece in pieces[1:]) / 1000
     warnings = []
     if staying_ml > LEAST_STAYING_ML:
         warnings.append(f"the cut would touch the organ in another place too; {staying_ml:.1f} ml there stay")
-    specimen, remnant = pieces[0], outer
-    if len(pieces) > 1:
-        remnant = whole - specimen
-    # What the cut separates from the organ elsewhere, such as the rim of a tumour on a stalk, comes with the specimen.
-    remains = sorted(remnant.decompose(), key=lambda piece: -piece.volume())
-    if len(remains) > 1:
-        remnant = remains[0]
-        specimen = whole - remnant
+    specimen = pieces[0]
+    remnant, *separated = _pieces(outer if len(pieces) == 1 else whole - specimen)
+    if separated:
+        # What the cut separates from the organ elsewhere, such as the rim of a tumour on a stalk, comes with the specimen.
+        specimen = _pieces(whole - remnant)[0]
     _check_size(specimen.volume(), organ.volume)
     own, of_own = surface_of(specimen)
     rest, of_rest = surface_of(remnant)
     capsule = whole.original_id()
     return Cut(line, settings, own, rest, of_own != capsule, of_rest != capsule, tuple(warnings))
+
+
+def _pieces(solid: manifold3d.Manifold) -> list[manifold3d.Manifold]:
+    """The separate pieces of a solid, the largest first. Rounding of a Boolean operation leaves flat ones, which are none."""
+    pieces = [piece for piece in solid.decompose() if piece.volume() > LEAST_PIECE_MM3]
+    return sorted(pieces, key=lambda piece: -piece.volume())
+
+
+def _distance_mm(piece: manifold3d.Manifold, line: ScoreLine) -> float:
+    """Mean distance [mm] of a line's points from a solid's surface."""
+    near = places_on(surface_of(piece)[0], line.points)[0]
+    return float(np.linalg.norm(near - line.points, axis=1).mean())
 
 
 def _check_size(volume_mm3: float, organ_mm3: float) -> None:

@@ -79,6 +79,8 @@ class FemSolid:
         self._gradient = _operator(self.basis, gradients.transpose(0, 2, 3, 1))
         surface = FacetBasis(mesh, ElementTetP2(), mapping, intorder=6)
         self.at_surface, self.areas = _operator(surface, _values(surface)), surface.dx.ravel()
+        if not np.isfinite(self.at_surface.data).all():
+            raise MeshError("a curved tetrahedron at the surface is nearly folded over")
 
     def deformation(self, displacement: np.ndarray) -> np.ndarray:
         """Deformation gradients F at the Gauss points, shape (points, 3, 3), for displacements [mm] (nodes, 3)."""

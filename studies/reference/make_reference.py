@@ -23,6 +23,13 @@ COARSER = 1.4
 
 def graded_mesh(kidney: trimesh.Trimesh, press: FemPress, near_mm: float) -> MeshTet2:
     """Tetrahedra that fill the kidney, with edges of ``near_mm`` where the transducer touches it. Raises MeshError."""
+    return tetrahedra(kidney, size_around(kidney, press, near_mm))
+
+
+def size_around(
+    kidney: trimesh.Trimesh, press: FemPress, near_mm: float
+) -> Callable[[np.ndarray], np.ndarray]:
+    """The length (n,) of edges [mm] at points (n, 3): ``near_mm`` where the transducer touches the kidney, and longer away from it."""
     box = RoundedBox(np.array(press.size_mm), press.edge_mm)
     beside = np.abs(kidney.vertices[:, :2] - press.over_mm) - np.array(press.size_mm[:2]) / 2
     top = kidney.vertices[(beside <= 0).all(axis=1), 2].max()
@@ -32,7 +39,7 @@ def graded_mesh(kidney: trimesh.Trimesh, press: FemPress, near_mm: float) -> Mes
         away = np.maximum(box.gap(points - touching) - near_mm, 0.0)
         return np.minimum(near_mm + GROWTH * away, BULK_OF_NEAR * near_mm)
 
-    return tetrahedra(kidney, wanted)
+    return wanted
 
 
 def make_reference(

@@ -13,12 +13,14 @@ from mmgpy import MmgMesh3D
 from skfem import Basis, ElementTetP2, MeshTet, MeshTet2
 
 from scenes.surfaces import signed_distance_from
-from studies.reference.fem_solid import MeshError
+from studies.reference.fem_solid import CurvedMapping, MeshError
 
 GRID_MM = 3.0
 CHORD_OF_SIZE = 0.05
 GRADATION = 3.0
 VOLUME_ERROR = 2e-3
+# Volume ratio in a curved tetrahedron, least of largest, below which its edges become straight.
+LEAST_SCALE = 0.1
 
 
 def tetrahedra(surface: trimesh.Trimesh, size_mm: Callable[[np.ndarray], np.ndarray]) -> MeshTet2:
@@ -85,4 +87,24 @@ def _curved(straight: MeshTet, surface: trimesh.Trimesh) -> MeshTet2:
         np.ascontiguousarray(surface.vertices, float),
         np.ascontiguousarray(surface.faces, np.int64),
     )[2].T
-    return MeshTet2(places, mesh.t)
+    return _unfolded(MeshTet2(places, mesh.t))
+
+
+def _unfolded(mesh: MeshTet2) -> MeshTet2:
+    """The mesh with straight edges where tetrahedra would fold over, or nearly: at a sharp edge of the surface."""
+    while len(folded := _folded(mesh)):
+        straight = MeshTet2.from_mesh(MeshTet(mesh.doflocs[:, : mesh.t.max() + 1], mesh.t))
+        middles = Basis(mesh, ElementTetP2(), intorder=1).element_dofs[4:, folded]
+        places = mesh.doflocs.copy()
+        places[:, middles] = straight.doflocs[:, middles]
+        if np.array_equal(places, mesh.doflocs):
+            raise MeshError("a tetrahedron of the mesh is inside out")
+        mesh = MeshTet2(places, mesh.t)
+    return mesh
+
+
+def _folded(mesh: MeshTet2) -> np.ndarray:
+    """The curved tetrahedra (n,) whose volume ratio to straight ones changes its sign among their nodes, or almost vanishes."""
+    scale = CurvedMapping(mesh, ElementTetP2(), mesh.bndelem).detDF(ElementTetP2().doflocs.T)
+    least, most = np.sort(np.abs(scale), axis=1)[:, [0, -1]].T
+    return np.flatnonzero((scale.min(axis=1) * scale.max(axis=1) <= 0) | (least < LEAST_SCALE * most))

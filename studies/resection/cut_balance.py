@@ -1,0 +1,170 @@
+"""Balance after a cut: beads in what remains of the embedded patient's kidney, beside finite elements that solve the remnant alone.
+
+Nephron has the lattice of the whole organ, of which ``remove_tissue`` takes the specimen, as ``PressedOrgan.apply_cut`` does.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from rehearsal.configuration import PRESETS, Setup
+from rehearsal.resection.cut import Cut, CutSettings, cut_organ, faces_of
+from scenes.anatomy import LoadedAnatomy, load_anatomy
+from scenes.scene import EMBEDDED, PAPER, load_scene
+from scenes.surfaces import translated
+from sim.neo_hookean import NeoHookean
+from sim.removed_tissue import RemovedTissue
+from sim.solver import StepSettings
+from studies.accuracy.bead_case import BeadCase, load_case
+from studies.accuracy.bead_errors import bead_errors, null_errors
+from studies.accuracy.bead_experiment import BeadExperiment
+from studies.resection.cut_lines import line_over
+from ultrasound.probe_manipulator import poses_between
+
+UNCUT = Path(__file__).parents[1] / "reference" / "embedded"
+SETTINGS = CutSettings("enucleoresection", 3.0)
+# Edges of the finite elements at the crater and by the transducer; the coarser mesh shows their own error.
+EDGE_MM, COARSER_MM = 5.6, 7.8
+STAGES = 3
+BALANCE_BAR_MM = 0.15
+
+
+@dataclass(frozen=True)
+class CutCase:
+    """A bead case of a remnant, of which ``case.organ`` is the whole organ, and what is removed from it."""
+
+    case: BeadCase
+    tissue: RemovedTissue
+
+
+class CutBeadExperiment(BeadExperiment):
+    """A bead experiment on an organ from which tissue is removed: before it settles, or when the whole organ has settled."""
+
+    def __init__(self, cut: CutCase, setup: Setup, settles_first: bool) -> None:
+        super().__init__(cut.case, setup)
+        self.settles_first = settles_first
+        tissue = cut.tissue
+        self._organ, removed, remaining = (
+            translated(each, -self.origin) for each in (cut.case.organ, tissue.removed, tissue.remaining)
+        )
+        self._tissue = RemovedTissue(removed, remaining, tissue.is_new)
+
+    def prepare(self, setup: Setup) -> StepSettings:
+        """Warm up, remove the tissue and warm up what remains; or the latter alone."""
+        if not self.settles_first:
+            self._remove()
+            return super().prepare(setup)
+        step, pose = super().prepare(setup), self._away()
+        self._remove()
+        for _ in range(setup.warm_up_steps):
+            self.solver.step(step, poses_between(pose, pose, step.substeps))
+        return step
+
+    def _remove(self) -> None:
+        assert isinstance(self.model, NeoHookean)
+        self.model.remove_tissue(self._organ, self._tissue, [])
+        self.beads.attach_again()
+
+
+@dataclass(frozen=True)
+class BalanceRow:
+    """Mean and largest error of the beads [mm] at each stage, and how far they moved since the first one in the mean."""
+
+    organ: str
+    setup: Setup
+    case: BeadCase
+    errors: np.ndarray
+
+    @cached_property
+    def means_mm(self) -> list[float]:
+        """Mean error at each stage [mm]."""
+        return [float(stage.mean()) for stage in self.errors]
+
+    @property
+    def is_within(self) -> bool:
+        """Whether the mean error is within 0.15 mm at each stage."""
+        return max(self.means_mm) <= BALANCE_BAR_MM
+
+    def described(self) -> dict[str, object]:
+        """Values for the table and the files."""
+
+        def joined(values: np.ndarray) -> str:
+            return " / ".join(f"{value:.2f}" for value in values)
+
+        return dict(
+            organ=self.organ,
+            beads=len(self.case.beads),
+            depths=joined(self.case.indentation_mm),
+            mean_mm=joined(self.errors.mean(axis=1)),
+            max_mm=joined(self.errors.max(axis=1)),
+            moved_mm=joined(null_errors(self.case).mean(axis=1)),
+            within="yes" if self.is_within else "no",
+        )
+
+
+def balance_rows() -> tuple[list[BalanceRow], np.ndarray]:
+    """The errors of the uncut kidney and of the remnant, and the distances (stages, n) [mm] of the remnant's beads from those of the coarser mesh.
+
+    Taichi must be started. Raises MeshError, NotConvergedError.
+    """
+    setup = PRESETS["neo-hookean"]["balanced"]
+    uncut = _first_stages(load_case(UNCUT))
+    cut, to_coarser = cut_case(uncut)
+    experiments = {
+        "whole": BeadExperiment(uncut, setup),
+        "cut, then settled": CutBeadExperiment(cut, setup, settles_first=False),
+        "settled, then cut": CutBeadExperiment(cut, setup, settles_first=True),
+    }
+    rows = [
+        BalanceRow(name, setup, each.case, bead_errors(each.case, each.run(setup).beads))
+        for name, each in experiments.items()
+    ]
+    return rows, to_coarser
+
+
+def _first_stages(case: BeadCase) -> BeadCase:
+    arrays = ("measured", "poses", "indentation_mm", "probe_force_n")
+    return replace(case, **{name: getattr(case, name)[:STAGES] for name in arrays})
+
+
+def cut_case(uncut: BeadCase) -> tuple[CutCase, np.ndarray]:
+    """The case of the remnant, pressed as the uncut one is, and the distances (stages, n) [mm] of its beads from those of the coarser mesh.
+
+    Raises MeshError, NotConvergedError, ResectionError.
+    """
+    from studies.reference.make_reference import blue_noise, in_case_frame
+    from studies.reference.pressed_beads import pressed_beads
+
+    anatomy, gravity = embedded_anatomy(), np.array(load_scene(PAPER).gravity.direction)
+    cut = embedded_cut(anatomy)
+    organ, specimen, remnant = (
+        in_case_frame(each, gravity, anatomy.organ) for each in (anatomy.organ, cut.specimen, cut.remnant)
+    )
+    support = load_anatomy(load_scene(PAPER), PAPER.parent).shapes[0]
+    assert isinstance(support, trimesh.Trimesh)
+    beads, bed = blue_noise(remnant), faces_of(remnant, cut.on_remnant)
+    given = remnant, bed, in_case_frame(support, gravity, anatomy.organ), beads
+    coarse = pressed_beads(*given, COARSER_MM, uncut.indentation_mm)[0]
+    measured, at, force = pressed_beads(*given, EDGE_MM, uncut.indentation_mm)
+    poses = uncut.poses.copy()
+    poses[:, :3, 3] = at
+    case = replace(
+        uncut, organ=organ, beads=beads, measured=measured, poses=poses, probe_force_n=-force, name="remnant"
+    )
+    tissue = RemovedTissue(specimen, remnant, cut.on_remnant)
+    return CutCase(case, tissue), np.linalg.norm(measured - coarse, axis=2)
+
+
+def embedded_anatomy() -> LoadedAnatomy:
+    """The embedded patient, whose kidney is that of the uncut case."""
+    return load_anatomy(load_scene(EMBEDDED), EMBEDDED.parent)
+
+
+def embedded_cut(anatomy: LoadedAnatomy) -> Cut:
+    """The cut of the embedded patient: enucleoresection with a margin of 3 mm."""
+    assert anatomy.tumour is not None
+    line = line_over(anatomy.organ, anatomy.tumour, SETTINGS.margin_mm)
+    return cut_organ(anatomy.organ, line, SETTINGS, np.asarray(anatomy.tumour.vertices))

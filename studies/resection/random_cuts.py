@@ -1,0 +1,135 @@
+"""Random scores and cuts on the device: each is refused in words, or gives two closed bodies and tissue that stays valid."""
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+
+from errors import UserError
+from rehearsal.rehearsal import Rehearsal
+from rehearsal.resection.cut import Cut
+from rehearsal.resection.resection_state import NO_RESECTION, CutRequest
+from scenes.surfaces import volume_mm3
+from sim.fields import array_of
+from studies.harness import positions_of
+from studies.resection.random_scores import RandomScore, ScoredPatient, random_score
+
+STEPS = 30
+VOLUME_BAR = 0.005
+
+
+@dataclass(frozen=True)
+class RandomResult:
+    """What came of a random cut: ``refused`` says why it was not made, ``faults`` what is wrong with it."""
+
+    patient: str
+    seed: int
+    kind: str
+    refused: str = ""
+    faults: tuple[str, ...] = ()
+    specimen_ml: float | None = None
+    volume_change_percent: float | None = None
+
+    @property
+    def reason(self) -> str:
+        """The refusal without its numbers."""
+        return re.sub(r"\d+(\.\d+)?", "N", self.refused)
+
+
+def random_results(patient: str, rehearsal: Rehearsal, seeds: Sequence[int]) -> Iterator[RandomResult]:
+    """Make the cut of each seed from the organ at rest, and undo it."""
+    scored = scored_patient(rehearsal)
+    for seed in seeds:
+        score = random_score(scored, seed)
+        rehearsal.reset()
+        try:
+            yield _result(patient, seed, rehearsal, score)
+        except UserError as error:
+            yield RandomResult(patient, seed, score.kind, refused=str(error))
+        except Exception as error:  # any other error is a fault, and the next seeds are tried
+            fault = f"{type(error).__name__}: {error}"
+            yield RandomResult(patient, seed, score.kind, faults=(fault,))
+
+
+def scored_patient(rehearsal: Rehearsal) -> ScoredPatient:
+    """The patient whom scores are set on. Its hilum is the middle of the vessels, or the innermost place of the surface."""
+    organ = rehearsal.whole_organ
+    if "vessel" in rehearsal.whole_parts:
+        hilum = np.asarray(rehearsal.whole_parts["vessel"].vertices).mean(axis=0)
+    else:
+        vertices = np.asarray(organ.vertices)
+        hilum = vertices[np.linalg.norm(vertices - organ.center_mass, axis=1).argmin()]
+    return ScoredPatient(organ, rehearsal.whole_tumour, hilum)
+
+
+def _result(patient: str, seed: int, rehearsal: Rehearsal, score: RandomScore) -> RandomResult:
+    restorations = rehearsal.divergence_check.restorations
+    request = CutRequest.of(score.settings, score.seen, rehearsal.body.snapshot().position)
+    marked = NO_RESECTION.with_marks(score.marks)
+    rehearsal.set_resection(marked)
+    rehearsal.set_resection(type(marked)(marked.marks, request))
+    cut = rehearsal.cut
+    assert cut is not None
+    faults = surface_faults(cut, rehearsal.whole_organ)
+    for _ in range(STEPS):
+        rehearsal.advance(rehearsal.pose)
+    change = volume_change(rehearsal, cut)
+    if not np.isfinite(positions_of(rehearsal.solver)).all():
+        faults.append("positions are not finite")
+    if rehearsal.divergence_check.restorations > restorations:
+        faults.append("the divergence check restored a state")
+    if not abs(change) <= VOLUME_BAR:
+        faults.append(f"remnant and specimen have {100 * change:+.2f} % of the organ's volume")
+    return RandomResult(
+        patient,
+        seed,
+        score.kind,
+        faults=tuple(faults),
+        specimen_ml=cut.specimen.volume / 1000,
+        volume_change_percent=100 * change,
+    )
+
+
+def surface_faults(cut: Cut, organ: trimesh.Trimesh) -> list[str]:
+    """What is wrong with the surfaces of a cut at rest, in words."""
+    faults = []
+    for name, surface in (("specimen", cut.specimen), ("remnant", cut.remnant)):
+        if not surface.is_watertight or surface.volume <= 0:
+            faults.append(f"the {name} is not closed")
+        pieces = surface.body_count
+        if pieces != 1:
+            faults.append(f"the {name} has {pieces} pieces")
+    total = (cut.specimen.volume + cut.remnant.volume) / organ.volume
+    if abs(total - 1) > VOLUME_BAR:
+        faults.append(f"specimen and remnant have {100 * total:.2f} % of the organ's volume at rest")
+    return faults
+
+
+def volume_change(rehearsal: Rehearsal, cut: Cut) -> float:
+    """Relative change of the volume of the remnant as it is now and the specimen as cut together, from the organ's as it was cut."""
+    rehearsal.organ_skin.update()
+    remnant = volume_mm3(array_of(rehearsal.organ_skin.vertices), cut.remnant.faces)
+    specimen, organ = (
+        volume_mm3(rehearsal.carried_then(np.asarray(each.vertices)), each.faces)
+        for each in (cut.specimen, rehearsal.whole_organ)
+    )
+    return (remnant + specimen) / organ - 1
+
+
+def summary(results: Sequence[RandomResult]) -> str:
+    """How many were made and refused, the reasons, and each failure with its seed."""
+    made = [each for each in results if not each.refused]
+    failed = [each for each in results if each.faults]
+    lines = [
+        f"{len(results)} random scores: {len(made)} cut, {len(results) - len(made)} refused, {len(failed)} failed"
+    ]
+    reasons = Counter(each.reason for each in results if each.refused)
+    lines += [f"  {number:3d} refused: {reason}" for reason, number in reasons.most_common()]
+    lines += [
+        f"  FAILED {each.patient}, seed {each.seed} ({each.kind}): {'; '.join(each.faults)}"
+        for each in failed
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,231 @@
+"""Cuts of a ball, whose volumes are those of caps, balls, cones and frusta; any cut of an ellipsoid; and what is refused."""
+
+from contextlib import suppress
+
+import numpy as np
+import pytest
+import trimesh
+from cut_ball import HEIGHT_MM, MARKS, RIM_MM, R, ball, cap_mm3, circle, inset, line_on_ball
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rehearsal.resection.cut import (
+    STEEPEST,
+    CutSettings,
+    cut_organ,
+    faces_of,
+    grown,
+    part_left,
+)
+from rehearsal.resection.score_line import ResectionError, score_line
+
+ORGAN = ball(R)
+LINE = line_on_ball(ORGAN)
+ABOVE = cap_mm3(R, R - HEIGHT_MM)
+# A ball's surface is inside it by a share s; arcs between marks are inside their circle by 1 - cos(pi / n): together a share of each
+# width, so twice of an area.
+WIDTH_ERROR = 2 * inset(ORGAN) + 1 - np.cos(np.pi / MARKS)
+# The cutter is simplified by 0.05 mm, all around.
+VOLUME_ERROR = 2 * WIDTH_ERROR + 3 * 0.05 / RIM_MM
+
+
+def cut(settings: CutSettings, tumour: np.ndarray | None = None):
+    return cut_organ(ORGAN, LINE, settings, np.zeros((0, 3)) if tumour is None else tumour)
+
+
+def tumour_of(radius: float) -> np.ndarray:
+    """Points of a ball about the middle of the line."""
+    return np.asarray(ball(radius, (0.0, 0.0, HEIGHT_MM)).vertices)
+
+
+def test_an_enucleation_is_the_cap_and_the_half_of_the_tumour_below():
+    made = cut(CutSettings("enucleation", 5.0), tumour_of(RIM_MM))
+    exact = ABOVE + 2 / 3 * np.pi * RIM_MM**3
+    assert made.specimen.volume == pytest.approx(exact, rel=VOLUME_ERROR)
+
+
+def test_an_enucleoresection_has_the_margin_more():
+    made = cut(CutSettings("enucleoresection", 4.0), tumour_of(RIM_MM - 4.0))
+    exact = ABOVE + 2 / 3 * np.pi * RIM_MM**3
+    # The margin's hull is up to 5 % of it larger, on the half ball's surface.
+    more = 2 * np.pi * RIM_MM**2 * 0.05 * 4.0
+    assert -VOLUME_ERROR * exact < made.specimen.volume - exact < VOLUME_ERROR * exact + more
+
+
+def test_a_wedge_to_a_depth_is_the_cap_and_a_cone():
+    made = cut(CutSettings("wedge", depth_mm=12.0))
+    exact = ABOVE + np.pi * RIM_MM**2 * 12.0 / 3
+    assert made.specimen.volume == pytest.approx(exact, rel=VOLUME_ERROR)
+
+
+@pytest.mark.parametrize("technique", ["enucleation", "enucleoresection"])
+def test_a_floor_at_a_depth_is_half_as_wide_as_the_line(technique):
+    made = cut(CutSettings(technique, depth_mm=12.0))
+    frustum = np.pi * RIM_MM**2 * 12.0 * (1 + 0.5 + 0.25) / 3
+    assert made.specimen.volume == pytest.approx(ABOVE + frustum, rel=VOLUME_ERROR)
+
+
+def test_the_walls_of_a_wedge_meet_below_the_tumour_and_its_margin():
+    """A cone from the rim that touches a ball: its half-angle has the sine (r + m) / distance of apex and centre."""
+    tumour = np.asarray(ball(3.0, (0.0, 0.0, HEIGHT_MM - 6.0)).vertices)
+    made = cut(CutSettings("wedge", 2.0), tumour)
+    distance = np.linalg.norm(made.resection_surface().triangles_center - [0, 0, HEIGHT_MM - 6.0], axis=1)
+    # 5 mm, inside by mesh, simplification and the line's width, and 5 % of the margin outside.
+    lost = 5 * inset(ball(3.0)) + 0.05 + WIDTH_ERROR * RIM_MM
+    assert 5.0 - lost < distance.min() < 5.0 + 0.05 * 2.0 + lost
+    deepest = HEIGHT_MM - made.specimen.vertices[:, 2].min()
+    sine = 5.0 / (deepest - 6.0)
+    tangent = RIM_MM / deepest
+    assert sine / np.sqrt(1 - sine**2) == pytest.approx(tangent, rel=0.05)
+
+
+def test_a_wedge_is_not_steeper_than_stated():
+    """A tumour as wide as the line would need walls that never meet."""
+    tumour = np.asarray(ball(RIM_MM, (0.0, 0.0, HEIGHT_MM)).vertices) * [1.0, 1.0, 0.3] + [
+        0,
+        0,
+        0.7 * HEIGHT_MM - 2.0,
+    ]
+    depth = HEIGHT_MM - tumour[:, 2].min()
+    made = cut(CutSettings("wedge", 0.0), tumour)
+    assert HEIGHT_MM - made.specimen.vertices[:, 2].min() == pytest.approx(STEEPEST * depth, abs=0.2)
+
+
+@pytest.mark.parametrize("technique", ["enucleation", "enucleoresection", "wedge"])
+def test_specimen_and_remnant_are_closed_and_together_the_organ(technique):
+    made = cut(CutSettings(technique, 4.0), tumour_of(RIM_MM - 4.0))
+    for surface in (made.specimen, made.remnant):
+        assert surface.is_watertight and surface.body_count == 1
+    assert made.specimen.volume + made.remnant.volume == pytest.approx(ORGAN.volume, rel=1e-9)
+    bed, own = faces_of(made.remnant, made.on_remnant), made.resection_surface()
+    assert bed.area == pytest.approx(own.area, rel=1e-6)
+    # The bed is within the organ, capsule faces are on the ball; a face at the rim is cut, and has the plane of its own.
+    capsule = faces_of(made.specimen, ~made.on_specimen)
+    assert np.linalg.norm(capsule.vertices, axis=1).min() > R * (1 - 2 * inset(ORGAN))
+    assert own.triangles_center[:, 2].min() < HEIGHT_MM - 5.0 and made.settings.technique == technique
+    # Never beyond the line, seen along its direction.
+    assert (
+        np.linalg.norm(made.specimen.vertices[made.specimen.vertices[:, 2] < HEIGHT_MM - 1, :2], axis=1).max()
+        < RIM_MM + 0.1
+    )
+
+
+def test_what_is_cut_in_another_place_stays_with_a_warning():
+    """An organ like a C: the cutter above the lower arm reaches through the upper one."""
+    block, slot = trimesh.creation.box([60.0, 40.0, 60.0]), trimesh.creation.box([60.0, 60.0, 20.0])
+    organ = trimesh.boolean.difference([block, slot.apply_translation([15.0, 0.0, 0.0])])
+    turn = 2 * np.pi * np.arange(24) / 24
+    marks = np.column_stack([15 + 8 * np.cos(turn), 8 * np.sin(turn), np.full(24, -10.0)])
+    made = cut_organ(organ, score_line(organ, marks), CutSettings("wedge", depth_mm=9.0), np.zeros((0, 3)))
+    assert made.specimen.volume == pytest.approx(np.pi * 64 * 9 / 3, rel=0.05)
+    assert made.specimen.bounds[1, 2] < -9.9
+    (warning,) = made.warnings
+    # The column through the upper arm, 20 mm high.
+    assert "another place" in warning and f"{np.pi * 64 * 20 / 1000:.1f} ml" in warning
+    assert made.specimen.volume + made.remnant.volume == pytest.approx(organ.volume, rel=1e-9)
+
+
+def test_what_hangs_on_the_specimen_alone_comes_with_it():
+    """A knob on a thin stalk beside the score's middle: the cut of the stalk takes the knob."""
+    stalk = trimesh.creation.cylinder(1.0, 8.0).apply_translation([0.0, 0.0, R + 3.0])
+    knob = ball(5.0, (0.0, 0.0, R + 10.0))
+    organ = trimesh.boolean.union([ORGAN, stalk, knob])
+    turn = 2 * np.pi * np.arange(16) / 16
+    marks = np.column_stack([4 * np.cos(turn), 4 * np.sin(turn), np.full(16, R)])
+    made = cut_organ(organ, score_line(organ, marks), CutSettings("wedge", depth_mm=4.0), np.zeros((0, 3)))
+    assert made.specimen.bounds[1, 2] == pytest.approx(R + 15.0, abs=0.1)
+    assert made.specimen.volume > knob.volume and made.remnant.body_count == 1
+    assert made.specimen.volume + made.remnant.volume == pytest.approx(organ.volume, rel=1e-9)
+
+
+@given(st.floats(0.01, 10), st.integers(0, 2**31))
+@settings(max_examples=20, deadline=None)
+def test_a_grown_body_contains_all_balls_and_little_more(by_mm, seed):
+    random = np.random.default_rng(seed)
+    points = random.normal(size=(30, 3)) * 8
+    around = grown(points, by_mm)
+    directions = random.normal(size=(200, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    more = (around @ directions.T).max(axis=0) - (points @ directions.T).max(axis=0)
+    assert more.min() >= by_mm * (1 - 1e-9) and more.max() <= 1.05 * by_mm + 1e-9
+
+
+@given(st.integers(0, 2**31))
+@settings(max_examples=25, deadline=None)
+def test_any_cut_of_an_ellipsoid_is_closed_and_sums_to_the_whole(seed):
+    random = np.random.default_rng(seed)
+    organ = ball(1.0, fine=3).apply_scale([45.0, 28.0, 22.0])
+    place = np.asarray(organ.vertices)[random.integers(len(organ.vertices))]
+    tumour = ball(random.uniform(3, 9), tuple(0.8 * place), fine=2)
+    marks = place + random.normal(size=(int(random.integers(3, 20)), 3)) * random.uniform(2, 14)
+    technique = ("enucleation", "enucleoresection", "wedge")[random.integers(3)]
+    depth = float(random.uniform(1, 25)) if random.random() < 0.4 else None
+    depth_or_tumour = CutSettings(technique, random.uniform(0, 8), depth), np.asarray(tumour.vertices)
+    made = None
+    with suppress(ResectionError):
+        made = cut_organ(organ, score_line(organ, marks), *depth_or_tumour)
+    if made is None:
+        return
+    for surface in (made.specimen, made.remnant):
+        assert surface.is_watertight and surface.volume > 0 and surface.body_count == 1
+    assert made.specimen.volume + made.remnant.volume == pytest.approx(organ.volume, rel=1e-6)
+    assert faces_of(made.remnant, made.on_remnant).area == pytest.approx(
+        made.resection_surface().area, rel=1e-4
+    )
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (CutSettings("wedge", depth_mm=None), "no part of the tumour was seen"),
+        (CutSettings("wedge", depth_mm=200.0), None),
+    ],
+)
+def test_a_cut_without_a_depth_is_refused_and_a_deep_one_stays_within_the_line(settings, words):
+    if words:
+        with pytest.raises(ResectionError, match=words):
+            cut(settings)
+    else:
+        # Through to the other side: never wider than the line.
+        assert np.abs(cut(settings).specimen.vertices[:, :2]).max() < RIM_MM + 0.1
+
+
+def test_a_cut_of_next_to_nothing_is_refused():
+    tiny = score_line(ORGAN, circle(12, np.radians(5)))
+    with pytest.raises(ResectionError, match=r"removes only 0.0\d ml"):
+        cut_organ(ORGAN, tiny, CutSettings("wedge", depth_mm=1.0), np.zeros((0, 3)))
+
+
+def test_a_cut_of_most_of_the_organ_is_refused():
+    equator = score_line(ORGAN, circle(60, np.radians(80)))
+    with pytest.raises(ResectionError, match=r"removes \d\d% of the organ, expected at most 50%"):
+        cut_organ(ORGAN, equator, CutSettings("enucleation", depth_mm=25.0), np.zeros((0, 3)))
+
+
+def test_a_part_loses_what_is_in_the_specimen():
+    made = cut(CutSettings("wedge", depth_mm=12.0))
+    part = ball(6.0, (0.0, 0.0, HEIGHT_MM - 8.0))
+    left = part_left(part, made)
+    taken = trimesh.boolean.intersection([part, made.specimen]).volume
+    assert taken > 100 and left.volume == pytest.approx(part.volume - taken, rel=1e-6)
+    assert part_left(part, None) is part
+    assert part_left(ball(2.0, (0.0, 0.0, HEIGHT_MM)), made) is None
+    away = ball(4.0, (0.0, 0.0, -15.0))
+    assert part_left(away, made).volume == pytest.approx(away.volume, rel=1e-9)
+
+
+def test_what_is_outside_of_the_organ_stays_unless_the_part_is_within_it():
+    made = cut(CutSettings("wedge", depth_mm=12.0))
+    vessel = ball(5.0, (R, 0.0, 0.0))
+    outside = trimesh.boolean.difference([vessel, ORGAN]).volume
+    assert part_left(vessel, made).volume == pytest.approx(vessel.volume, rel=1e-9)
+    assert part_left(vessel, made, is_within=True).volume == pytest.approx(vessel.volume - outside, rel=1e-6)
+
+
+def test_a_piece_next_to_nothing_that_rounding_leaves_is_in_neither():
+    """Beside the organ, above the score: too small to be a piece, so that it neither stays nor comes with the specimen."""
+    crumb = trimesh.creation.icosahedron().apply_scale(0.002).apply_translation([0.0, 0.0, R + 2.0])
+    organ = trimesh.util.concatenate([ORGAN, crumb])
+    made = cut_organ(organ, LINE, CutSettings("wedge", depth_mm=12.0), np.zeros((0, 3)))
+    assert made.specimen.body_count == 1 and made.remnant.body_count == 1
+    assert made.specimen.bounds[1, 2] < R + 1.0

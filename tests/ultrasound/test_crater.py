@@ -1,0 +1,161 @@
+"""A crater in volumes at rest: its HU, acoustic values and distances inside and outside, and what was there before."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import rotation_about
+from test_scanner import PIXELS, PROBE, anatomy
+
+from sim.embedding import Unmoved
+from ultrasound.acoustics import properties
+from ultrasound.crater import FILLINGS, FINE_MM, Crater
+from ultrasound.sampled_volume import AIR_HU, SampledVolume
+from ultrasound.scanner import Scanner
+
+RADIUS, VOXEL_MM = 9.0, 1.5
+MIDDLE = np.array([4.0, -2.0, 3.0])
+SURFACE = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS).apply_translation(MIDDLE)
+# How far the mesh is inside the ball, and the error of distances between the points of the crater's grid: h^2 / 8 times two curvatures.
+INSET = RADIUS - np.linalg.norm(SURFACE.triangles_center - MIDDLE, axis=1).min()
+
+
+WITHIN = INSET + FINE_MM**2 / 4 / RADIUS
+
+
+def volume_of(values: np.ndarray) -> SampledVolume:
+    """A volume of oblique voxels around the crater."""
+    index_from_mm = np.eye(4)
+    index_from_mm[:3, :3] = rotation_about([1, 2, 3], 25) / VOXEL_MM
+    index_from_mm[:3, 3] = (np.array(values.shape[:3]) - 1) / 2
+    return SampledVolume(values, index_from_mm)
+
+
+def places(volume: SampledVolume) -> np.ndarray:
+    """Centres (x, y, z, 3) of the voxels [mm]."""
+    index = np.stack(np.indices(volume.shape), axis=-1)
+    return (index - volume.index_from_mm[:3, 3]) @ np.linalg.inv(volume.index_from_mm[:3, :3]).T
+
+
+def put(volume: SampledVolume, box, values: np.ndarray) -> np.ndarray:
+    """All voxels after those of a box were replaced."""
+    volume.set_values(box, values)
+    return volume.values((slice(None),) * 3)
+
+
+@pytest.fixture
+def from_surface() -> np.ndarray:
+    """Distance (x, y, z) [mm] of the voxels from the ball, negative inside."""
+    return np.linalg.norm(places(volume_of(np.zeros((32, 30, 28)))) - MIDDLE, axis=-1) - RADIUS
+
+
+@pytest.mark.parametrize(("filling", "hu"), [("fluid", 10.0), ("air", AIR_HU)])
+def test_it_has_the_hu_of_what_fills_it(device, from_surface, filling, hu):
+    random = np.random.default_rng(3).normal(50, 10, (32, 30, 28)).astype(np.float32)
+    volume, crater = volume_of(random), Crater(SURFACE, filling)
+    after = put(volume, *crater.replaced(volume, crater.hu()))
+    # Values of 1000 are rounded to 6e-5.
+    half = VOXEL_MM / 2
+    assert (from_surface < -half).sum() > 300
+    assert after[from_surface < -half - WITHIN] == pytest.approx(hu, abs=1e-4)
+    np.testing.assert_array_equal(after[from_surface > half + WITHIN], random[from_surface > half + WITHIN])
+    # Between, each voxel changes by the share of its width that is inside: the shares sum to the ball's volume. A linear share is exact
+    # for a plane; the ball's curvature adds 4 pi h^2 r / 12.
+    share = ((after - random) / (hu - random)).sum() * VOXEL_MM**3
+    curved = 4 * np.pi * RADIUS * VOXEL_MM**2 / 12
+    sampled = 4 * np.pi * RADIUS**2 * INSET
+    noise = VOXEL_MM**3 * np.sqrt(4 * np.pi * RADIUS**2 / VOXEL_MM**2) / 2
+    assert share == pytest.approx(4 / 3 * np.pi * RADIUS**3, abs=curved + sampled + noise)
+
+
+def test_acoustic_values_are_those_of_urine_or_of_air(device, from_surface):
+    tissue = np.tile(np.array([1.0, 2.0, 3.0, 4.0], np.float32), (32, 30, 28, 1))
+    zero, one = np.zeros((1, 1, 1), np.int32), np.ones((1, 1, 1), np.int32)
+    wanted = dict(
+        fluid=properties(zero + 10, one, {1: "urine"})[0, 0, 0],
+        air=properties(zero + int(AIR_HU), zero, {})[0, 0, 0],
+    )
+    assert not np.allclose(wanted["fluid"], wanted["air"])
+    for filling in FILLINGS:
+        volume, crater = volume_of(tissue), Crater(SURFACE, filling)
+        after = put(volume, *crater.replaced(volume, crater.acoustics()))
+        inside = from_surface < -VOXEL_MM / 2 - WITHIN
+        # Rounding of the values before, up to 4.
+        np.testing.assert_allclose(
+            after[inside], np.broadcast_to(wanted[filling], after[inside].shape), atol=1e-6
+        )
+        assert (after[from_surface > VOXEL_MM / 2 + WITHIN] == tissue[0, 0, 0]).all()
+
+
+def test_distances_are_those_of_what_remains(device, from_surface):
+    """A half space below z = 6, of which the crater is taken: the larger of both distances."""
+    index = places(volume_of(np.zeros((32, 30, 28))))
+    organ = (index[..., 2] - 6.0).astype(np.float32)
+    volume, crater = volume_of(organ), Crater(SURFACE, "air")
+    after = put(volume, *crater.without(volume))
+    near = from_surface < VOXEL_MM
+    wanted = np.maximum(organ, -from_surface)
+    np.testing.assert_allclose(after[near], wanted[near], atol=INSET + 1e-4)
+    inside = (from_surface < -INSET) & (organ < 0)
+    assert (after[inside] > 0).all() and inside.sum() > 300
+    far = from_surface > 2 * RADIUS
+    np.testing.assert_array_equal(after[far], organ[far])
+
+
+def test_the_box_has_all_voxels_that_it_changes_and_ends_with_the_volume(device):
+    volume = volume_of(np.zeros((10, 12, 11), np.float32))
+    crater = Crater(SURFACE, "air")
+    box, values = crater.replaced(volume, crater.hu())
+    assert all(0 <= each.start < each.stop <= n for each, n in zip(box, volume.shape, strict=True))
+    assert values.shape == tuple(each.stop - each.start for each in box)
+    far = Crater(SURFACE.copy().apply_translation([500.0, 0, 0]), "air")
+    assert far.replaced(volume, far.hu())[1].size == 0
+
+
+def scanner_of_a_ball() -> Scanner:
+    """A ball of kidney whose upper part is an artery."""
+    ball = anatomy()
+    height = np.indices(ball.labels.shape)[2] - (ball.labels.shape[2] - 1) / 2
+    labels = np.where(height > 4, 2 * ball.labels, ball.labels)
+    tissues = {1: "kidney", 2: "artery"}
+    return Scanner(replace(ball, labels=labels, tissues=tissues), Unmoved(), PROBE, PIXELS)
+
+
+@pytest.mark.parametrize("filling", FILLINGS)
+def test_a_scanner_shows_the_crater_and_restores_all_voxels_to_the_bit(device, filling):
+    scanner, middle = scanner_of_a_ball(), np.array([0.0, 0.0, 8.0])
+    surface = trimesh.creation.icosphere(subdivisions=3, radius=5.0).apply_translation(middle)
+    crater, everything = Crater(surface, filling), (slice(None),) * 3
+
+    def volumes() -> dict[str, np.ndarray]:
+        return {name: getattr(scanner, name).values(everything) for name in ("ct", "organ", "tissue", "flow")}
+
+    def at_middle(name: str) -> np.ndarray:
+        volume = getattr(scanner, name)
+        return volume.values(everything)[
+            tuple(np.rint(volume.index_from_mm @ [*middle, 1.0]).astype(int)[:3])
+        ]
+
+    before = volumes()
+    assert before["flow"].any()
+    scanner.set_crater(crater)
+    during = volumes()
+    assert at_middle("ct") == crater.hu() and not at_middle("flow").any()
+    assert at_middle("tissue") == pytest.approx(crater.acoustics(), abs=1e-6)
+    # Fluid carries sound, as the organ does; air does not.
+    assert np.array_equal(before["organ"], during["organ"]) == (filling == "fluid")
+    assert at_middle("organ") * (1 if filling == "air" else -1) > 0
+    scanner.set_crater(None)
+    for name, values in volumes().items():
+        np.testing.assert_array_equal(values, before[name], err_msg=name)
+
+
+def test_a_volume_that_is_built_after_the_cut_has_the_crater_too(device):
+    surface = trimesh.creation.icosphere(subdivisions=3, radius=5.0).apply_translation([0.0, 0.0, 8.0])
+    early, late = scanner_of_a_ball(), scanner_of_a_ball()
+    everything = (slice(None),) * 3
+    _ = early.tissue
+    for scanner in (early, late):
+        scanner.set_crater(Crater(surface, "air"))
+    np.testing.assert_array_equal(late.tissue.values(everything), early.tissue.values(everything))
