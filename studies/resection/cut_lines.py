@@ -19,7 +19,7 @@ BESIDE_MM, DRAWN_IN, SHALLOW_MM = 10.0, 0.6, 12.0
 
 
 @dataclass(frozen=True)
-class PlannedCut:
+class StudyCut:
     """A cut of the study, and how its line is placed."""
 
     placed: str
@@ -27,16 +27,16 @@ class PlannedCut:
     cut: Cut
 
 
-def planned_cuts(organ: trimesh.Trimesh, tumour: trimesh.Trimesh) -> Iterator[PlannedCut]:
+def planned_cuts(organ: trimesh.Trimesh, tumour: trimesh.Trimesh) -> Iterator[StudyCut]:
     """All techniques and margins along lines around tumour and margin, then badly placed cuts that leave tumour. Raises ResectionError."""
     lines = {margin: line_over(organ, tumour, margin) for margin in MARGINS_MM}
     points = np.asarray(tumour.vertices)
     for technique in TECHNIQUES:
         for margin, line in lines.items():
             settings = CutSettings(technique, margin)
-            yield PlannedCut("around", settings, cut_organ(organ, line, settings, points))
+            yield StudyCut("around", settings, cut_organ(organ, line, settings, points))
     for placed, line, settings in _badly_placed(organ, lines[3.0]):
-        yield PlannedCut(placed, settings, cut_organ(organ, line, settings, points))
+        yield StudyCut(placed, settings, cut_organ(organ, line, settings, points))
 
 
 def line_over(organ: trimesh.Trimesh, tumour: trimesh.Trimesh, margin_mm: float) -> ScoreLine:

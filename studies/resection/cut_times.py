@@ -74,14 +74,14 @@ def _time_parts(rehearsal: Rehearsal, resection: Resection, times: CutTimes) -> 
     organ, tumour, scanner = rehearsal.whole_organ, rehearsal.whole_tumour, rehearsal.scanner
     assert tumour is not None and scanner is not None and resection.cut is not None
     settings = resection.cut.settings
-    times.measure("  line", lambda: score_line(organ, resection.points()))
+    times.measure("- line", lambda: score_line(organ, resection.points()))
     line = score_line(organ, resection.points())
     points = np.asarray(tumour.vertices)
-    times.measure("  specimen and remnant", lambda: cut_organ(organ, line, settings, points))
+    times.measure("- specimen and remnant", lambda: cut_organ(organ, line, settings, points))
     made = cut_organ(organ, line, settings, points)
-    times.measure("  tissue and contacts", lambda: PressedOrgan.apply_cut(rehearsal, made))
+    times.measure("- tissue and contacts", lambda: PressedOrgan.apply_cut(rehearsal, made))
     times.measure(
-        "  crater in the image", lambda: scanner.set_crater(Crater(made.specimen, settings.filling))
+        "- crater in the image", lambda: scanner.set_crater(Crater(made.specimen, settings.filling))
     )
     rehearsal.apply_cut(None)
 

@@ -150,9 +150,9 @@ def _times(patients: Sequence[Patient]) -> Part:
             start("cpu")
             medians[name] = cut_times(Rehearsal(scene, anatomy)).medians()
     names = list(next(iter(medians.values())))
-    table = [[name, *(f"{each[name]:.1f}" for each in medians.values())] for name in names]
+    table = [[name, *(each[name] for each in medians.values())] for name in names]
     text = (
         f"Times, median in ms ({REPEATS} cuts; {ROUNDS} x {STEPS} steps before and after, in turn)\n"
-        f"{text_table(['', *medians], table)}"
+        f"{text_table(['', *medians], table, ['', *['.1f'] * len(medians)])}"
     )
     return text, dict(medians_ms=medians)
