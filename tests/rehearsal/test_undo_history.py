@@ -30,6 +30,8 @@ DOWN = np.array([0.0, 0.0, -1.0])
 class Numbers:
     """A rehearsal whose tissue is two points, moved by all that a step is told; the hand over it, and its ball, are real."""
 
+    origin = np.zeros(3)
+
     def __init__(self) -> None:
         self.settings = StepSettings(time_step_s=STEP_S)
         self.scene = SimpleNamespace(tissue=NeoHookeanTissue())
@@ -42,7 +44,7 @@ class Numbers:
         )
         self.pose = self.manipulator.pose()
         self.young_kpa, self.steps = 15.0, 0
-        self.resection, self.origin = NO_RESECTION, np.zeros(3)
+        self.resection = NO_RESECTION
         self.whole_organ, self.whole_tumour, self.judgement = ball, None, None
         self.position = np.arange(6, dtype=np.float32).reshape(2, 3)
         self.velocity = np.zeros((2, 3), np.float32)
