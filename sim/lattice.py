@@ -74,8 +74,12 @@ class Lattice:
 
     def carried(self, points: np.ndarray, position: np.ndarray) -> np.ndarray:
         """Where points (k, 3) [mm] at rest are for positions (n, 3) [mm] of the nodes."""
-        nodes, weights = self.interpolation(points)
-        return points + np.einsum("kn,kna->ka", weights, (position - self.nodes)[nodes])
+        return points + self.displacement(self.interpolation(points), position)
+
+    def displacement(self, at: tuple[np.ndarray, np.ndarray], position: np.ndarray) -> np.ndarray:
+        """Displacement (k, 3) [mm] at places with these nodes and weights (k, 8), for positions (n, 3) [mm] of the nodes."""
+        nodes, weights = at
+        return np.einsum("kn,kna->ka", weights, (position - self.nodes)[nodes])
 
 
 def places_in_cells(

@@ -9,6 +9,7 @@ from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.score_line import ResectionError
 from render.viewer import Score, Settings
 from sim.fields import array_of
+from sim.neo_hookean import NeoHookean
 from sim.skinning import Skin
 from ultrasound.crater import Filling
 from ultrasound.scanner import plane_section
@@ -39,7 +40,8 @@ class ResectionView:
         self.fault = ""
         self.tumour_mm = np.zeros(0)
         self._planned: Cut | None = None
-        self._skin: Skin | None = None
+        # Nodes and weights of the vertices of the coming specimen. Not a skin, of which there would be one for each change.
+        self._carried_by: tuple[np.ndarray, np.ndarray] = np.zeros((0, 8), int), np.zeros((0, 8))
         self._of: tuple[object, ...] = ()
 
     def update(self, settings: CutSettings, is_seen: IsSeen) -> None:
@@ -53,24 +55,25 @@ class ResectionView:
         if of == self._of:
             return
         self._of = of
-        self.fault, self._planned, self._skin = self.rehearsal.score_fault, None, None
+        self.fault, self._planned = self.rehearsal.score_fault, None
         self.tumour_mm = distance_to_tumour(self.rehearsal)
-        line = self.rehearsal.score
-        if line is None or resection.cut is not None:
+        line, model = self.rehearsal.score, self.rehearsal.model
+        if line is None or resection.cut is not None or not isinstance(model, NeoHookean):
             return
         try:
             self._planned = cut_organ(self.rehearsal.whole_organ, line, settings, points[seen])
-            self._skin = Skin(self.rehearsal.model, self._planned.specimen.vertices)
+            self._carried_by = model.lattice.interpolation(self._planned.specimen.vertices)
         except ResectionError as error:
             self.fault = str(error)
 
     def section(self, plane_from_world: np.ndarray) -> np.ndarray | None:
         """The coming resection surface on an image plane: segments (n, 2, 2) [mm]; None without one."""
-        if self._planned is None or self._skin is None:
+        planned, model = self._planned, self.rehearsal.model
+        if planned is None or not isinstance(model, NeoHookean):
             return None
-        self._skin.update()
-        faces = np.asarray(self._planned.specimen.faces)[self._planned.on_specimen]
-        return plane_section(array_of(self._skin.vertices).astype(float), faces, plane_from_world)
+        moved = model.lattice.displacement(self._carried_by, array_of(model.body.position))
+        faces = np.asarray(planned.specimen.faces)[planned.on_specimen]
+        return plane_section(planned.specimen.vertices + moved, faces, plane_from_world)
 
     def score(self, margin_mm: float) -> Score | None:
         """The score and the planned one as they lie now, None without either; a part is near where its margin is smaller than asked."""
