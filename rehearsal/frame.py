@@ -94,7 +94,8 @@ class Frames(Generic[Source]):
     def with_resection(self, view: View, settings: Settings) -> View:
         """A view with the score and the coming cut."""
         planned = cut_settings(settings)
-        self.resection.update(planned, lambda points: self.measurements.coverage.is_seen(points))
+        now_s = self.source.session.time_s
+        self.resection.update(planned, lambda points: self.measurements.coverage.is_seen(points), now_s)
         score = self.resection.score(planned.margin_mm)
         if score is None:
             return view
@@ -176,6 +177,8 @@ class WindowFrames(Frames[WindowInput]):
         if self.rehearsal.cut is not self._shown_cut:
             self._shown_cut = self.rehearsal.cut
             self.viewer.change_geometry(geometry_of(self.rehearsal))
+            # Its frames show other surfaces.
+            self.cine = Cine()
         self._shown_input_s = None if self.frozen or self._last_step is None else self._last_step.input_s
         probe = probe_with_settings(self.rehearsal.probe, controls.settings)
         with self.times.stage("image"):
@@ -279,7 +282,7 @@ class WindowFrames(Frames[WindowInput]):
     def present(self, view: View, probe: Probe, controls: Controls) -> View:
         """Add measurements, caliper and status to the view."""
         shown = self.cine.shown if self._shows_earlier else self._measured(view, probe, controls.settings)
-        view = self.with_resection(shown.view, controls.settings)
+        view = shown.view if self._shows_earlier else self.with_resection(shown.view, controls.settings)
         self.caliper.point(controls.pointed_mm, view.transducer_pose)
         if not self.frozen:
             self.caliper.go_with(view.transducer_pose)

@@ -10,6 +10,7 @@ import numpy as np
 import taichi as ti
 import trimesh
 
+from errors import PatientError
 from rehearsal.build_solver import embedding_cell_mm
 from rehearsal.pressed_organ import OrganState, PressedOrgan
 from rehearsal.resection.cut import Cut, cut_organ, part_left
@@ -22,7 +23,7 @@ from scenes.solids import solid_of
 from scenes.surfaces import translated, volume_mm3
 from scenes.terminal import ReportProgress, no_progress
 from sim.embedding import Embedding
-from sim.fields import array_of
+from sim.fields import FieldSet, array_of
 from sim.skinning import Skin
 from ultrasound.crater import Crater
 from ultrasound.probe import Probe
@@ -48,6 +49,7 @@ REST_PLACES = 48
 MOST_OF_HILUM = 0.25
 # Gap between the organ and the specimen beside it.
 BESIDE_MM = 8.0
+TUMOUR = "tumour"
 # Cuts of this many states are kept, for undo and redo.
 KEPT_CUTS = 4
 
@@ -88,14 +90,16 @@ class Rehearsal(PressedOrgan):
         self.score_fault = ""
         self._score_points: Skin | None = None
         self._cuts: dict[Resection, Cut] = {}
-        self._judgements: dict[Resection, Judgement] = {}
+        self._judgements: dict[Resection, Judgement | None] = {}
+        self.judgement_fault = ""
         self._labels = anatomy.labels, anatomy.tissues
         self.whole_tumour = anatomy.tumour and translated(anatomy.tumour, -self.origin)
         self.whole_parts = {tissue: translated(part, -self.origin) for tissue, part in anatomy.parts.items()}
         meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
         self.supports = [_shrunk(translated(mesh, -self.origin), SUPPORT_SUNK_MM) for mesh in meshes]
         progress("Building the model: surfaces")
-        self._build_surfaces()
+        self._fields, self._fields_before, self._score_fields = FieldSet(), FieldSet(), FieldSet()
+        self._build_surfaces(self._remains(None))
         self._build_scanner(scanned, acoustics)
         if settles:
             progress("Building the model: the tissue comes to rest")
@@ -111,20 +115,30 @@ class Rehearsal(PressedOrgan):
         self.pose = self.manipulator.pose()
         self.settled = self.snapshot()
 
-    def _build_surfaces(self) -> None:
-        """The surfaces that move with the tissue: of the whole organ and its parts, or of what remains of them after a cut."""
-        self.tumour = self.whole_tumour and part_left(self.whole_tumour, self.cut, is_within=True)
+    def _remains(self, cut: Cut | None) -> dict[str, trimesh.Trimesh]:
+        """What a cut leaves of the tumour and the other parts that are drawn, by tissue. Raises PatientError."""
         # The sinus surrounds the other parts, and would hide them.
         parts = {tissue: part for tissue, part in self.whole_parts.items() if tissue != "sinus"}
-        remains = {tissue: part_left(part, self.cut) for tissue, part in parts.items()}
-        self.parts = {tissue: part for tissue, part in remains.items() if part is not None}
-        self.organ_skin = Skin(self.model, self.organ.vertices)
-        self.tumour_skin = self._tumour_border = None
-        if self.tumour is not None:
-            self._tumour_border = Skin(self.model, self.tumour.vertices)
-            drawn = self.tumour.vertices + TUMOUR_LIFT_MM * self.tumour.vertex_normals
-            self.tumour_skin = Skin(self.model, drawn)
-        self.part_skins = {tissue: Skin(self.model, part.vertices) for tissue, part in self.parts.items()}
+        left = {tissue: part_left(part, cut) for tissue, part in parts.items()}
+        if self.whole_tumour is not None:
+            left[TUMOUR] = part_left(self.whole_tumour, cut, is_within=True)
+        return {tissue: part for tissue, part in left.items() if part is not None}
+
+    def _build_surfaces(self, remains: dict[str, trimesh.Trimesh]) -> None:
+        """The surfaces that move with the tissue: of the organ, and of its tumour and other parts by tissue."""
+        # A window may still show those of before this cut, but no longer those of before the last one.
+        self._fields_before.free()
+        self._fields_before, self._fields = self._fields, FieldSet()
+        self.tumour = remains.get(TUMOUR)
+        self.parts = {tissue: part for tissue, part in remains.items() if tissue != TUMOUR}
+        with self._fields:
+            self.organ_skin = Skin(self.model, self.organ.vertices)
+            self.tumour_skin = self._tumour_border = None
+            if self.tumour is not None:
+                self._tumour_border = Skin(self.model, self.tumour.vertices)
+                drawn = self.tumour.vertices + TUMOUR_LIFT_MM * self.tumour.vertex_normals
+                self.tumour_skin = Skin(self.model, drawn)
+            self.part_skins = {tissue: Skin(self.model, part.vertices) for tissue, part in self.parts.items()}
 
     def _build_scanner(self, scanned: ScannedAnatomy | None, acoustics: Future[np.ndarray] | None) -> None:
         image = self.scene.image
@@ -204,7 +218,9 @@ class Rehearsal(PressedOrgan):
             except ResectionError as error:
                 self.score_fault = str(error)
         shown = marks if self.score is None else np.concatenate([self.score.points, self.score.marks])
-        self._score_points = Skin(self.model, shown) if len(marks) else None
+        self._score_fields.free()
+        with self._score_fields:
+            self._score_points = Skin(self.model, shown) if len(marks) else None
 
     def score_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Present places [mm] of the score: points (k, 3) of the closed line, and its marks (n, 3)."""
@@ -241,8 +257,10 @@ class Rehearsal(PressedOrgan):
             )
 
     def apply_cut(self, cut: Cut | None) -> None:
+        # Before anything changes: a part's surface may be one that cannot be cut.
+        remains = self._remains(cut)
         super().apply_cut(cut)
-        self._build_surfaces()
+        self._build_surfaces(remains)
         self.embedding.skin.attach_again()
         if self.scanner is not None:
             self.scanner.set_crater(None if cut is None else Crater(cut.specimen, cut.settings.filling))
@@ -271,7 +289,7 @@ class Rehearsal(PressedOrgan):
 
     @property
     def judgement(self) -> Judgement | None:
-        """The figures of the cut; None without a cut, or without a tumour to judge by."""
+        """The figures of the cut; None without a cut, without a tumour to judge by, or where ``judgement_fault`` says why there are none."""
         cut, tumour, key = self.cut, self.whole_tumour, self.resection
         if cut is None or tumour is None:
             return None
@@ -281,7 +299,11 @@ class Rehearsal(PressedOrgan):
             labels, tissues = self._labels
             moved = labels and Grid(labels.voxels, labels.index_from_mm @ shift_by(self.origin))
             given = cut, self.whole_organ, tumour, self.whole_parts, as_cut, moved, tissues
-            self._judgements = {key: judge(*given)}
+            self.judgement_fault = ""
+            try:
+                self._judgements = {key: judge(*given)}
+            except PatientError as error:
+                self._judgements, self.judgement_fault = {key: None}, f"no figures of the cut: {error}"
         return self._judgements[key]
 
     def update_surfaces(self) -> None:

@@ -215,29 +215,39 @@ class RehearsalRun:
             self._end(source.bookmarks)
             _echo(_verdict(replay))
 
-    def _judged(self) -> dict[str, Any]:
-        """Write the page of the resection and print its figures; return them."""
-        # Matplotlib takes half a second to import.
-        from rehearsal.resection.resection_page import report_of, rows_of, save_page
+    def _save_page(self, report: dict[str, Any]) -> None:
+        """Write the page of the resection, and print its figures."""
+        from rehearsal.resection.resection_page import rows_of, save_page
 
-        report = report_of(self.rehearsal, self.files.resection_plan)
         click.echo("\n".join(f"{name:<20}  {value}" for name, value in rows_of(report)))
         try:
             click.echo("Saved " + " and ".join(map(str, save_page(self.rehearsal, report, self.asked.out))))
         except OSError as error:
             click.echo(f"Warning: the page of the resection is not saved: {error.strerror}")
-        return report
+
+    def _resection(self) -> dict[str, Any] | None:
+        """The figures of the resection; None without any."""
+        if self.rehearsal.judgement is None:
+            return None
+        # Matplotlib takes half a second to import.
+        from rehearsal.resection.resection_page import report_of
+
+        return report_of(self.rehearsal, self.files.resection_plan)
 
     def _end(self, bookmarks: int) -> None:
-        summary = self.measurements.summary(bookmarks)
+        summary, report = self.measurements.summary(bookmarks), self._resection()
         click.echo(summary_text(summary))
-        if self.rehearsal.judgement is not None:
-            summary |= dict(resection=self._judged())
+        if report is not None:
+            summary |= dict(resection=report)
         guide = self.measurements.guide
         if guide is not None:
             _echo(guide.in_words(summary.get(f"seen_{guide.plan.target}")))
         if self.recorder is not None:
             self.recorder.close(summary)
+        # After the session is safe.
+        if report is not None:
+            self._save_page(report)
+        if self.recorder is not None:
             scene = [] if self.asked.scene == EMBEDDED else [self.asked.scene]
             again = shell_command("rehearse", *scene, "--replay", self.recorder.path)
             click.echo(self.recorder.fault or f"Recorded; replay it with: {again}")

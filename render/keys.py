@@ -222,6 +222,10 @@ def _with(
             raise KeysError(
                 f"{section}.{action} = {place!r}: unknown {what}; {meant(place, printed.values())}"
             )
+        if action in (*HELD, *VIEW_ACTIONS) and place.lower().startswith(WITH_SHIFT.lower()):
+            raise KeysError(
+                f"{section}.{action} = {place!r}: is held down, and cannot be with Shift; choose a single key"
+            )
         chosen[action] = printed[place.lower()]
     taken: dict[str, str] = {}
     for action, place in chosen.items():

@@ -33,9 +33,9 @@ MAX_SCORE, MAX_MARKS, MARK_MM, SCORE_LIFT_MM, SCORE_WIDTH = 600, 200, 1.2, 0.6, 
 
 
 class SceneView:
-    """Fields of the drawn objects; ``draw`` draws them all."""
+    """Fields of the drawn objects; ``draw`` draws them all. ``before`` is the view of other geometry that this one replaces."""
 
-    def __init__(self, geometry: Geometry, camera: OrbitCamera):
+    def __init__(self, geometry: Geometry, camera: OrbitCamera, before: "SceneView | None" = None):
         self.camera = camera
         self._organ = ShadedSurface(*geometry.organ)
         self._tumour = self._support = None
@@ -54,9 +54,10 @@ class SceneView:
         self._probe_mesh = DrawnMesh(len(self._probe.vertices))
         self._probe_edges = transducer_shape.edges(*shape)
         self._edge_points = field_of(self._probe_edges, within=1)
-        self._plan: PlanLines | None = None
-        self._score: ScoreLines | None = None
-        self._cut_face: CutFace | None = None
+        # Made when they are first drawn, and for other geometry only once.
+        self._plan: PlanLines | None = before._plan if before else None
+        self._score: ScoreLines | None = before._score if before else None
+        self._cut_face: CutFace | None = before._cut_face if before else None
         self._cut_side = 0.0
         self._plane = transducer_shape.image_plane_grid(PLANE_ROWS, PLANE_COLUMNS)
         self._plane_indices = transducer_shape.grid_triangles(PLANE_ROWS, PLANE_COLUMNS).reshape(-1)

@@ -9,7 +9,7 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from sim.fields import array_of, fields_of, fill, fill_evenly, run_kernel
+from sim.fields import array_of, empty_fields, field_of, fields_of, fill, fill_evenly, run_kernel
 
 ORGAN, TINT = (0.66, 0.27, 0.23), (0.24, 0.60, 0.36)
 SOLID, GLASS = 1.0, 0.30
@@ -51,14 +51,11 @@ class ShadedSurface:
         self.base, self.gloss = base, gloss
         count = vertices.shape[0]
         around, start = igl.vertex_triangle_adjacency(self.faces, count)
-        self.normal = ti.Vector.field(3, ti.f32, shape=count)
-        self.colour = ti.Vector.field(4, ti.f32, shape=count)
-        self._tint = ti.field(ti.f32, shape=count)
+        self.normal, self.colour = empty_fields((count, 3), (count, 4), within=1)
+        (self._tint,) = empty_fields((count,))
         self._tinted: np.ndarray | None = None
-        self._faces = ti.Vector.field(3, ti.i32, shape=len(self.faces))
-        self._start = ti.field(ti.i32, shape=count + 1)
-        self._around = ti.field(ti.i32, shape=len(around))
-        fill((self._faces, self.faces), (self._start, start), (self._around, around))
+        self._faces = field_of(self.faces, 1)
+        self._start, self._around = fields_of(start, around)
 
     def shade(self, eye, light, opacity: float = SOLID, cut: Cut | None = None) -> None:
         """Update normals and colours. A cut surface is solid."""

@@ -30,6 +30,7 @@ from render.viewer import Controls, Geometry, Settings, View
 from render.vulkan_device import draws_by_processor
 from render.window_layout import FULL_SIZE, Rect, WindowLayout
 from sim.device import on_cpu
+from sim.fields import FieldSet
 
 ZOOM_S = 0.5
 ZOOM_SENSE = {"zoom_in": -1.0, "zoom_out": 1.0}
@@ -113,7 +114,8 @@ class Window:
             (self.layout.width, self.layout.height),
         )
         self.camera = OrbitCamera(geometry.bounds, geometry.up, part, size[0] / size[1])
-        self._scene_view = SceneView(geometry, self.camera)
+        with FieldSet() as self._scene_fields:
+            self._scene_view = SceneView(geometry, self.camera)
         self._software = SoftwareScene(self.camera, size) if self._by_processor else None
         self._frame_at = self._scene_at = 0.0
         # Whether `draw_scene` has dealt with the 3D view of the next frame.
@@ -122,8 +124,10 @@ class Window:
 
     def change_geometry(self, geometry: Geometry) -> None:
         """Show other surfaces from now on, with camera and settings as they are."""
-        self._geometry = geometry
-        self._scene_view = SceneView(geometry, self.camera)
+        self._geometry, before = geometry, self._scene_fields
+        with FieldSet() as self._scene_fields:
+            self._scene_view = SceneView(geometry, self.camera, self._scene_view)
+        before.free()
         self._seen = ()
 
     def prepare(self, view: View) -> None:

@@ -13,6 +13,8 @@ from sim.device import on_cpu
 # Address of each tree of fields, for each start of Taichi; and the memory of each field.
 _ROOTS: WeakKeyDictionary[object, dict[int, int]] = WeakKeyDictionary()
 _VIEWS: WeakKeyDictionary[ti.Field, np.ndarray] = WeakKeyDictionary()
+# The sets of fields that are entered, the innermost last.
+_ENTERED: "list[FieldSet]" = []
 
 
 def field_of(values: np.ndarray, within: int = 0) -> ti.Field:
@@ -31,11 +33,47 @@ def fields_of(*arrays: np.ndarray, within: int = 0) -> list[ti.Field]:
     return fields
 
 
-def _empty(values: np.ndarray, within: int) -> ti.Field:
-    kind = ti.f32 if values.dtype.kind == "f" else ti.i32
-    shape, element = values.shape[: values.ndim - within], values.shape[values.ndim - within :]
+class FieldSet:
+    """Fields that are made while it is entered, and which ``free`` frees. Others stay until Taichi ends, which holds 512 sets of them."""
+
+    def __init__(self) -> None:
+        self._trees: list[ti._snode.snode_tree.SNodeTree] = []
+
+    def __enter__(self) -> "FieldSet":
+        _ENTERED.append(self)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        _ENTERED.remove(self)
+
+    def add(self, fields: Sequence[ti.Field], shapes: Sequence[tuple[int, ...]]) -> None:
+        """Place fields that have no place yet, of these shapes."""
+        builder = ti.FieldsBuilder()
+        for field, shape in zip(fields, shapes, strict=True):
+            builder.dense(ti.ij if len(shape) == 2 else ti.i, shape).place(field)
+        self._trees.append(builder.finalize())
+
+    def free(self) -> None:
+        """Free the fields, which must not be used any more."""
+        for tree in self._trees:
+            _ROOTS.get(impl.get_runtime(), {}).pop(tree.id, None)
+            tree.destroy()
+        self._trees.clear()
+
+
+def empty_fields(*shapes: tuple[int, ...], within: int = 0, kind: type = ti.f32) -> list[ti.Field]:
+    """Fields of these shapes, without values; as for ``field_of`` the last ``within`` axes are those of an element."""
     make = (ti.field, ti.Vector.field, ti.Matrix.field)[within]
-    return make(*element, kind, shape)
+    parts = [(shape[: len(shape) - within], shape[len(shape) - within :]) for shape in shapes]
+    if not _ENTERED:
+        return [make(*element, kind, outer) for outer, element in parts]
+    fields = [make(*element, kind) for _, element in parts]
+    _ENTERED[-1].add(fields, [outer for outer, _ in parts])
+    return fields
+
+
+def _empty(values: np.ndarray, within: int) -> ti.Field:
+    return empty_fields(values.shape, within=within, kind=ti.f32 if values.dtype.kind == "f" else ti.i32)[0]
 
 
 def fill(*pairs: tuple[ti.Field, np.ndarray]) -> None:

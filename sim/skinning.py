@@ -4,7 +4,7 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from sim.fields import fields_of, fill, run_kernel
+from sim.fields import empty_fields, fields_of, fill, run_kernel
 from sim.tissue_model import TissueModel
 
 
@@ -18,7 +18,7 @@ class Skin:
         self.points = np.asarray(points, np.float64)
         frame, weight = model.attach(self.points)
         self.model = model
-        self.vertices = ti.Vector.field(3, ti.f32, len(points))
+        self.vertices = empty_fields((len(points), 3), within=1)[0]
         self.rest, self.frame, self.weight = fields_of(self.points, frame, weight, within=1)
         self.update()
 

@@ -1,7 +1,7 @@
 """The user's input: mouse, keys and gamepad, or a tracked probe, move the transducer; undo, redo, reset and bookmarks."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields, replace
 from time import perf_counter
 from typing import Any
 
@@ -24,6 +24,9 @@ from render.viewer import Controls, TissueSettings
 # A transducer that moves by no more than this in a step is at rest [mm].
 STILL_MM = 1e-3
 Ray = tuple[np.ndarray, np.ndarray]
+# Controls that restore states or act on the organ, and their values when nobody uses them.
+AFTER_ACTION = ("reset", "undo", "redo", "bookmark", "to_bookmark", "score_image", "score_under", "cut_out")
+NOTHING = {each.name: each.default for each in fields(Controls) if each.name in AFTER_ACTION}
 
 
 @dataclass
@@ -48,6 +51,9 @@ class UserInput:
         # The pose that was asked for last; the transducer follows it.
         self._goal = self.session.rehearsal.pose
         self.history = History(self.session)
+        # The index at which a mark was set or a cut made last, and controls that wait for the step after it.
+        self._acted_at = -1
+        self._waiting: dict[str, Any] = {}
         self._follower = None if self.tracked is None else TrackingInput(self.tracked, self.session.rehearsal)
         if self.waits:
             self._wait(None)
@@ -72,6 +78,7 @@ class UserInput:
     def drive(self, solver: SolverProcess, controls: Controls, elapsed_s: float) -> None:
         """Give the solver the user's input after a time [s]; pause it for what changes more than the transducer's pose."""
         input_s = perf_counter()
+        controls = self._due(controls)
         if self._interrupts(controls):
             solver.pause()
             self.after_frame()
@@ -96,6 +103,7 @@ class UserInput:
 
         ``elapsed_s`` is the time since the last input, if not one step.
         """
+        controls = self._due(controls)
         self.session.note_changes("settings", asdict(controls.settings))
         rehearsal, follower = self.session.rehearsal, self._follower
         if self._restore_earlier(controls):
@@ -115,7 +123,8 @@ class UserInput:
             pose = self._tracked_pose(follower, controls, time_s)
         moves = bool(np.abs(pose - self._goal).max() > STILL_MM)
         presses = controls.press and follower is None
-        self.history.watch(moves or presses, presses, before)
+        if self.session.step_index != self._acted_at:
+            self.history.watch(moves or presses, presses, before)
         self._goal = pose
         return pose
 
@@ -137,21 +146,35 @@ class UserInput:
         if self.recorder is not None:
             self.recorder.keep_up(may_record_state=False)
 
+    def _due(self, controls: Controls) -> Controls:
+        """The controls, with those that had to wait: between a mark or a cut and what restores states there is a step at least, so that no two
+        states have one index.
+        """
+        asked = {
+            name: getattr(controls, name) or self._waiting.get(name, NOTHING[name]) for name in AFTER_ACTION
+        }
+        waits = self.session.step_index == self._acted_at
+        self._waiting = {name: value for name, value in asked.items() if value} if waits else {}
+        return replace(controls, **({name: NOTHING[name] for name in AFTER_ACTION} if waits else asked))
+
     def _operate(self, controls: Controls) -> None:
-        """Set marks of the score, or cut, as the user or the script asks for it; say what cannot be done."""
+        """Set marks of the score, or cut, as the user or the script asks for it: one of these in a step. Say what cannot be done."""
         settings = controls.settings
+        script_is_due = self.script is not None and self.script.is_due(self.session.time_s)
+        if self.session.step_index == self._acted_at:
+            return
         if controls.score_under is not None:
             ray = controls.score_under
             self._act(lambda: set_marks(self.session, mark_under(self.session.rehearsal, *ray)))
-        if controls.score_image:
+        elif controls.score_image:
             self._act(
                 lambda: set_marks(
                     self.session, marks_of_image(self.session.rehearsal, float(settings.margin_mm))
                 )
             )
-        if controls.cut_out:
+        elif controls.cut_out:
             self._act(lambda: self._cut(cut_settings(settings)))
-        while self.script is not None and self.script.is_due(self.session.time_s):
+        elif script_is_due and self.script is not None:
             action = self.script.take()
             self._act(lambda: self._follow_script(action))
 
@@ -164,14 +187,16 @@ class UserInput:
             self._cut(action.cut)
 
     def _cut(self, settings: CutSettings) -> None:
-        coverage = self.session.coverage
+        # Without a CT there are no images that could have shown the tumour.
+        coverage = self.session.coverage if self.session.rehearsal.scanner is not None else None
         cut(self.session, settings, None if coverage is None else coverage().is_seen)
         made, judgement = self.session.rehearsal.cut, self.session.rehearsal.judgement
         warnings = [
             *(made.warnings if made is not None else ()),
             *(judgement.warnings() if judgement is not None else ()),
         ]
-        for warning in warnings:
+        fault = self.session.rehearsal.judgement_fault
+        for warning in [*warnings, *([fault] if fault else [])]:
             self.notices.post(f"Warning: {warning}")
 
     def _act(self, action: Callable[[], None]) -> None:
@@ -184,6 +209,7 @@ class UserInput:
             self.notices.post(str(error))
         if self.session.rehearsal.resection != before:
             self.history.begin_at(step)
+            self._acted_at = self.session.step_index
 
     def _take_over(self) -> None:
         """Mouse, keys and gamepad replace the tracked probe."""

@@ -55,7 +55,9 @@ class SolverProcess:
 
     def build(self, scene: Scene, anatomy: LoadedAnatomy, probe: Probe, arch: str, pace: Pace) -> None:
         """Build the solver of a scene on a backend; ``pace`` chooses its steps by the clock."""
-        self._send("build", scene, replace(anatomy, ct=None, labels=None, parts={}), probe, arch, pace)
+        asked = getattr(scene.tissue, "parts", {})
+        parts = {tissue: part for tissue, part in anatomy.parts.items() if tissue in asked}
+        self._send("build", scene, replace(anatomy, ct=None, labels=None, parts=parts), probe, arch, pace)
 
     def settled(self) -> OrganState:
         """Return the organ at rest, as soon as it is known."""

@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 import manifold3d
 import numpy as np
 import trimesh
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from rehearsal.resection.score_line import ResectionError, ScoreLine, places_on
 from render.viewer import Technique
@@ -38,15 +40,15 @@ LEAST_LEFT_MM3 = 1.0
 STEEPEST = 3.0
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
 class CutSettings:
     """How the surgeon cuts: by which technique, with which margin [mm] around the tumour, or to a depth [mm] below the line where one is
-    given; ``filling`` is what the crater then contains.
+    given; ``filling`` is what the crater then contains. Raises ValueError for a value out of range.
     """
 
     technique: Technique = "enucleoresection"
-    margin_mm: float = 5.0
-    depth_mm: float | None = None
+    margin_mm: float = Field(default=5.0, ge=0, le=100)
+    depth_mm: float | None = Field(default=None, gt=0, le=500)
     filling: Filling = "fluid"
 
 

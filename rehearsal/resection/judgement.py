@@ -18,7 +18,7 @@ from scenes.solids import solid_of
 from scenes.surfaces import signed_distance_from, volume_mm3
 
 # The resection surface is measured in faces with edges of at most this length [mm].
-FACE_MM = 0.75
+FACE_MM, MOST_FACES = 0.75, 200_000
 # Limits [mm] below which the area of the margin is reported.
 MARGIN_LIMITS_MM = (1.0, 3.0, 5.0)
 # Parts of an organ that are not parenchyma.
@@ -167,7 +167,11 @@ def judge(
 
 
 def _small_faces(surface: trimesh.Trimesh) -> trimesh.Trimesh:
-    vertices, faces = trimesh.remesh.subdivide_to_size(surface.vertices, surface.faces, FACE_MM, max_iter=30)
+    # Faces of damaged tissue may be huge.
+    longest_mm = max(FACE_MM, float(np.sqrt(surface.area / MOST_FACES)))
+    vertices, faces = trimesh.remesh.subdivide_to_size(
+        surface.vertices, surface.faces, longest_mm, max_iter=30
+    )
     return trimesh.Trimesh(vertices, faces, process=False)
 
 

@@ -35,6 +35,8 @@ def cut(session: Session, settings: CutSettings, is_seen: IsSeen | None) -> None
     if rehearsal.cut is not None:
         raise ResectionError("the specimen is cut out already; undo the cut before you make another")
     tumour = rehearsal.whole_tumour
+    if tumour is None and settings.depth_mm is None:
+        raise ResectionError("this patient has no tumour that would give the depth of the cut; set a depth")
     points = np.zeros((0, 3)) if tumour is None else np.asarray(tumour.vertices)
     seen = np.ones(len(points), bool) if is_seen is None else is_seen(points)
     request = CutRequest.of(settings, seen, rehearsal.body.snapshot().position)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, field_validator
 
 from errors import UserError
 from rehearsal.resection.judgement import Judgement
@@ -16,6 +16,8 @@ from scenes.atomic_files import atomic_write
 
 # The first bytes of a plan contain this.
 MARK = b'"nephron_resection"'
+# Figures of a cut that are compared with those of the plan.
+COMPARED = ("parenchyma_removed_ml", "collecting_system_opened_mm2", "margin_min_mm", "positive_margin_mm2")
 Place = tuple[Number, Number, Number]
 
 
@@ -37,6 +39,14 @@ class PlannedCut(_FileModel):
     line_mm: Annotated[list[Place], Field(min_length=3, max_length=10_000)]
     figures: dict[str, JsonValue]
 
+    @field_validator("figures")
+    @classmethod
+    def _check_compared(cls, figures: dict[str, JsonValue]) -> dict[str, JsonValue]:
+        for name in COMPARED:
+            if not isinstance(figures.get(name), int | float):
+                raise ValueError(f"{name} is no number")
+        return figures
+
 
 class ResectionPlan(_FileModel):
     """``version`` is the Nephron that made it, ``anatomy`` the fingerprint of the patient's files."""
@@ -55,17 +65,11 @@ class ResectionPlan(_FileModel):
     def compared(self, judgement: Judgement) -> dict[str, Any]:
         """A rehearsed cut against the best planned one: what both cost, and how much more the rehearsed one took away."""
         planned, figures, made = self.best, self.best.figures, judgement.report()
-        more = (
-            "parenchyma_removed_ml",
-            "collecting_system_opened_mm2",
-            "margin_min_mm",
-            "positive_margin_mm2",
-        )
         return dict(
             planned_technique=planned.technique,
             planned_cost_ml=round(planned.cost_ml, 2),
             cost_ml=round(cost_ml(judgement, self.margin_mm), 2),
-            **{f"{name}_more": round(made[name] - float(figures[name]), 3) for name in more},  # type: ignore[arg-type]
+            **{f"{name}_more": round(made[name] - float(figures[name]), 3) for name in COMPARED},  # type: ignore[arg-type]
         )
 
 

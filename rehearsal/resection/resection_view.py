@@ -16,6 +16,8 @@ from ultrasound.scanner import plane_section
 
 # A line that is nearer to the tumour than the margin by no more than this is not warned of.
 TOLERANCE_MM = 0.5
+# Period of what the images have shown: a coming cut takes longer than a frame.
+SEEN_S = 0.5
 
 
 def cut_settings(settings: Settings) -> CutSettings:
@@ -43,18 +45,22 @@ class ResectionView:
         # Nodes and weights of the vertices of the coming specimen. Not a skin, of which there would be one for each change.
         self._carried_by: tuple[np.ndarray, np.ndarray] = np.zeros((0, 8), int), np.zeros((0, 8))
         self._of: tuple[object, ...] = ()
+        self._seen = b""
 
-    def update(self, settings: CutSettings, is_seen: IsSeen) -> None:
-        """Follow the marks, the settings, and what the images have shown of the tumour."""
+    def update(self, settings: CutSettings, is_seen: IsSeen, time_s: float) -> None:
+        """Follow the marks and the settings, and twice a second [s] what the images have shown of the tumour."""
         resection, tumour = self.rehearsal.resection, self.rehearsal.whole_tumour
         if not resection.marks and not self._of:
             return
         points = np.zeros((0, 3)) if tumour is None else np.asarray(tumour.vertices)
-        seen = is_seen(points)
-        of = resection.marks, resection.cut is None, settings, seen.tobytes()
+        of = resection.marks, resection.cut is None, settings, int(time_s / SEEN_S)
         if of == self._of:
             return
-        self._of = of
+        seen = is_seen(points)
+        has_news = of[:3] != self._of[:3] or seen.tobytes() != self._seen
+        self._of, self._seen = of, seen.tobytes()
+        if not has_news:
+            return
         self.fault, self._planned = self.rehearsal.score_fault, None
         self.tumour_mm = distance_to_tumour(self.rehearsal)
         line, model = self.rehearsal.score, self.rehearsal.model

@@ -18,7 +18,7 @@ from rehearsal.rehearsal import RehearsalState
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.resection_state import MOST_MARKS, CutRequest, Resection
 from sim.body import BodyState
-from sim.divergence_check import DivergenceState
+from sim.divergence_check import FARTHEST_MM, DivergenceState
 from sim.solver import SolverState
 from ultrasound.probe_manipulator import ManipulatorState
 
@@ -205,14 +205,14 @@ def _resection(arrays: dict[str, np.ndarray], nodes: tuple[int, ...]) -> Resecti
     if "resection.marks" not in arrays:
         return Resection()
     places = arrays["resection.marks"].reshape(-1, 3)
-    if len(places) > MOST_MARKS or not np.isfinite(places).all():
-        raise StateError("marks that are no places")
+    if len(places) > MOST_MARKS or not (np.abs(places) <= FARTHEST_MM).all():
+        raise StateError("marks that are no places on the organ")
     marks = Resection().with_marks(places)
     if "resection.settings" not in arrays:
         return marks
     settings = TypeAdapter(CutSettings).validate_python(json.loads(str(arrays["resection.settings"])))
     position = arrays["resection.nodes"]
-    if position.shape != nodes or position.dtype != np.float32 or not np.isfinite(position).all():
+    if position.shape != nodes or position.dtype != np.float32 or not (np.abs(position) <= FARTHEST_MM).all():
         raise StateError("a cut of another body")
     return replace(marks, cut=CutRequest(settings, arrays["resection.seen"].tobytes(), position.tobytes()))
 

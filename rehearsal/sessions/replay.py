@@ -61,7 +61,7 @@ class Replay:
         start = max((index for index in self.log.states if index <= aim and self._holds(index)), default=0)
         if start > 0:
             for index in range(start):
-                self._set(index)
+                self._set(index, operates=False)
             self.rehearsal.restore(self._state(self.log.states[start]))
             self.session.step_index, self.session.time_s = start, float(self.log.lengths_s[:start].sum())
         self.rehearsal.update_surfaces()
@@ -122,14 +122,18 @@ class Replay:
         self.session.end_step(pose, length_s, wrench)
         self._compare()
 
-    def _set(self, index: int) -> tuple[int | None, dict[str, Any]]:
-        """Set solver and tissue as at a step; return the step that it restores, if any, and its settings of the images."""
+    def _set(self, index: int, operates: bool = True) -> tuple[int | None, dict[str, Any]]:
+        """Set solver and tissue as at a step; return the step that it restores, if any, and its settings of the images.
+
+        A recorded state holds marks and cut: before one is restored they are not to be made (``operates``).
+        """
         back: int | None = None
         settings: dict[str, Any] = {}
         for event in self.log.events.get(index, []):
-            if event.kind in ("marks", "cut"):
+            if event.kind in ("marks", "cut") and operates:
                 # Undo restores the state before them.
                 self._keep_if_needed(index)
+                self._operate(event.kind, event.value)
             if event.kind == "solver":
                 set_solver(self.rehearsal, event.value)
             elif event.kind == "settings":
@@ -140,8 +144,6 @@ class Replay:
                 self.rehearsal.store_valid_state()
             elif event.kind == "bookmark":
                 self.bookmarks += 1
-            elif event.kind in ("marks", "cut"):
-                self._operate(event.kind, event.value)
         return back, settings
 
     def _keep_if_needed(self, index: int) -> None:

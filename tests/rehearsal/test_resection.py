@@ -98,7 +98,7 @@ def resected(rehearsal, marks: np.ndarray, settings: CutSettings | None = None) 
         ScriptedAction(0.0, score=scored),
         ScriptedAction(0.0, cut=settings or CutSettings("enucleoresection", MARGIN_MM)),
     )
-    moved(live)
+    moved(live, 2)
     return live
 
 
@@ -125,7 +125,8 @@ def test_a_cut_keeps_the_margin_and_undo_brings_all_back_bit_for_bit(rehearsal, 
     assert np.isfinite(array_of(rehearsal.body.position)).all()
     assert rehearsal.volume_ratio() == pytest.approx(1.0, abs=0.01)
     assert findings_of(judged)["specimen"].endswith("ml")
-    # Undo removes the cut with the marks, as both were made before one step.
+    moved(live, undo=True)
+    assert rehearsal.cut is None and len(rehearsal.resection.marks) == len(marks)
     moved(live, undo=True)
     assert rehearsal.resection == NO_RESECTION and rehearsal.cut is rehearsal.judgement is None
     assert rehearsal.digest() == before and rehearsal.organ is rehearsal.whole_organ
@@ -133,6 +134,7 @@ def test_a_cut_keeps_the_margin_and_undo_brings_all_back_bit_for_bit(rehearsal, 
     assert np.array_equal(array_of(rehearsal.organ_skin.vertices), vertices)
     again = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, "both", "speckle", 350, 40)
     assert all(np.array_equal(image[name], again[name]) for name in image)
+    moved(live, redo=True)
     moved(live, redo=True)
     assert rehearsal.cut is not None
 
@@ -218,14 +220,14 @@ def test_what_cannot_be_done_is_refused_in_words(rehearsal, marks):
         ScriptedAction(0.0, cut=CutSettings()),
         coverage=lambda: LiveMeasurements(rehearsal).coverage,
     )
-    moved(live)
+    moved(live, 2)
     assert "no part of the tumour was seen" in live.notices.present(lambda words: words)[0]
     moved(acting(rehearsal, ScriptedAction(0.0, cut=CutSettings())))
     assert rehearsal.cut is not None
     live = acting(
         rehearsal, ScriptedAction(0.0, cut=CutSettings()), ScriptedAction(0.0, score=[(0.0, 0.0, 0.0)])
     )
-    moved(live)
+    moved(live, 2)
     notices = live.notices.present(lambda words: words)
     assert all("cut out already" in notice for notice in notices) and len(notices) == 2
 
@@ -284,10 +286,10 @@ def test_the_view_warns_of_a_line_that_is_too_near_and_shows_the_coming_cut(rehe
     shown = ResectionView(rehearsal)
     seen = LiveMeasurements(rehearsal).coverage
     seen.seen[:] = True
-    shown.update(CutSettings(), seen.is_seen)
+    shown.update(CutSettings(), seen.is_seen, 0.0)
     assert shown.score(MARGIN_MM) is None and shown.status(CutSettings()) == ""
     rehearsal.set_resection(Resection().with_marks(marks))
-    shown.update(CutSettings(), seen.is_seen)
+    shown.update(CutSettings(), seen.is_seen, 0.0)
     score = shown.score(MARGIN_MM)
     assert not score.is_near.any() and "margin" not in shown.status(CutSettings())
     # Between marks a geodesic may be nearer than they are, by the sagitta of their arc.

@@ -54,7 +54,7 @@ def live_into(path: Path, seen: Callable[[], np.ndarray] | None = None) -> UserI
 def scripted(random: np.random.Generator) -> list[ScriptedAction]:
     """Sometimes a mark, or a cut; both are refused after a cut, and a cut without a mark."""
     marks = [(0.0, 0.0, float(random.uniform(5.0, 15.0)))] if random.random() < 0.15 else None
-    cut = CutSettings("wedge", float(random.integers(0, 9))) if random.random() < 0.08 else None
+    cut = CutSettings("wedge", float(random.integers(0, 9)), 5.0) if random.random() < 0.08 else None
     return [] if marks is None and cut is None else [ScriptedAction(0.0, marks, 5.0, cut)]
 
 

@@ -46,6 +46,7 @@ class Numbers:
         self.young_kpa, self.steps = 15.0, 0
         self.resection = NO_RESECTION
         self.whole_organ, self.whole_tumour, self.judgement = ball, None, None
+        self.scanner, self.judgement_fault = None, ""
         self.position = np.arange(6, dtype=np.float32).reshape(2, 3)
         self.velocity = np.zeros((2, 3), np.float32)
         self.contacts = {"plane": np.zeros((2, 4), np.float32)}
