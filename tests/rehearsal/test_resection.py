@@ -14,6 +14,7 @@ from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.judgement import findings_of
 from rehearsal.resection.operation import (
+    cut,
     distance_to_tumour,
     mark_under,
     marks_of_image,
@@ -270,6 +271,84 @@ def test_a_session_with_a_cut_replays_bit_for_bit_from_everywhere(patient, rehea
         assert report_of(rehearsal) == report
 
 
+def test_a_session_with_a_score_that_was_undone_replays_from_its_middle(patient, rehearsal, marks, tmp_path):
+    session = Session(rehearsal)
+    recorder = record(session, patient[1], "x64", tmp_path)
+    step_s = rehearsal.settings.time_step_s
+    good = [tuple(map(float, mark + rehearsal.origin)) for mark in marks]
+    far = tuple(map(float, 2 * marks[0] - 3 * marks.mean(axis=0) + rehearsal.origin))
+    actions = [
+        ScriptedAction(0.0, score=good),
+        ScriptedAction(3 * step_s, score=[far, good[8]]),
+        ScriptedAction(8 * step_s, cut=CutSettings("enucleoresection", MARGIN_MM)),
+    ]
+    live = UserInput(session, recorder, script=ResectionScript(actions))
+    moved(live, 6)
+    moved(live, 6, undo=True)
+    assert rehearsal.cut is not None and len(rehearsal.resection.marks) == len(marks)
+    moved(live, 3, bookmark=True)
+    digest = rehearsal.digest()
+    recorder.close({})
+    log = read_log(recorder.path)
+    for at_s in (0.0, log.length_s - step_s):
+        rehearsal.reset()
+        replay = Replay(rehearsal, log)
+        replay.begin_at(at_s)
+        for _ in replay.go_to(log.length_s):
+            pass
+        assert replay.differs_s is None and rehearsal.digest() == digest
+
+
+def test_undo_of_a_cut_restores_friction_under_a_pressing_probe(rehearsal, marks):
+    direction = np.array([0.65, -0.75, 0.12])
+    start = touching_at(rehearsal, rehearsal.whole_tumour.center_mass)
+    rehearsal.pose = start
+    for number in range(12):
+        rehearsal.advance(advanced(start, 0.5 * number))
+
+    def dragged() -> str:
+        pressed = rehearsal.pose
+        for number in range(4):
+            aside = np.eye(4)
+            aside[:3, 3] = 0.3 * (number + 1) * np.cross(direction, [1.0, 0, 0])
+            rehearsal.advance(aside @ pressed)
+        return rehearsal.digest()
+
+    before = rehearsal.snapshot()
+    digest = dragged()
+    rehearsal.restore(before)
+    set_marks(Session(rehearsal), marks)
+    cut(Session(rehearsal), CutSettings("enucleoresection", MARGIN_MM), None)
+    rehearsal.restore(before)
+    assert rehearsal.contacts.friction > 0 and dragged() == digest
+
+
+def test_a_part_that_cannot_be_cut_refuses_the_cut_before_anything_changes(rehearsal, marks, monkeypatch):
+    vessels = rehearsal.whole_parts["vessel"].copy()
+    vessels.faces = np.vstack([vessels.faces[0][::-1], vessels.faces[1:]])
+    set_marks(Session(rehearsal), marks)
+    before = rehearsal.model.lattice
+    monkeypatch.setitem(rehearsal.whole_parts, "vessel", vessels)
+    live = acting(rehearsal, ScriptedAction(0.0, cut=CutSettings("enucleoresection", MARGIN_MM)))
+    moved(live)
+    assert "cannot be cut" in live.notices.present(lambda words: words)[0]
+    assert rehearsal.cut is None and rehearsal.model.lattice is before and rehearsal.resection.cut is None
+
+
+def test_many_cuts_and_undos_leave_no_fields(rehearsal, marks):
+    set_marks(Session(rehearsal), marks)
+    uncut = rehearsal.snapshot()
+    cut(Session(rehearsal), CutSettings("enucleoresection", MARGIN_MM), None)
+    cut_out = rehearsal.snapshot()
+    trees = []
+    for _ in range(3):
+        rehearsal.restore(uncut)
+        rehearsal.restore(cut_out)
+        trees.append(max(tree.id for tree in rehearsal._fields._trees))
+    # Numbers of trees that were freed are given again.
+    assert trees[2] <= trees[0] + 1
+
+
 def test_a_state_with_a_cut_survives_as_text(rehearsal, marks):
     resected(rehearsal, marks)
     state = rehearsal.snapshot()
@@ -328,7 +407,11 @@ def test_page_score_and_plan_are_written_and_compared(patient, rehearsal, marks,
     points = np.array([point["position"] for point in curve["controlPoints"]])
     assert curve["type"] == "ClosedCurve" and curve["coordinateSystem"] == "LPS"
     assert np.abs(signed_distance_from(anatomy.organ, points)).max() < 0.3
-    path.write_text(path.read_text().replace('"margin_mm": 5.0', '"margin_mm": -5.0'))
+    whole = path.read_text()
+    path.write_text(whole.replace('"margin_min_mm"', '"margin_minimum_mm"'))
+    with pytest.raises(ResectionPlanError, match="margin_min_mm is no number"):
+        read_resection_plan(path)
+    path.write_text(whole.replace('"margin_mm": 5.0', '"margin_mm": -5.0'))
     with pytest.raises(ResectionPlanError, match="margin_mm"):
         read_resection_plan(path)
 

@@ -53,6 +53,10 @@ def test_every_action_does_one_thing():
     assert flags <= set(DEFAULT_KEYS), "controls that no key reaches"
 
 
+def test_a_held_key_cannot_be_with_shift(tmp_path):
+    assert "is held down" in refused(tmp_path, '[keys]\npush = "Shift+W"\n')
+
+
 def test_an_action_changes_what_it_is_named_for():
     controls = Controls(Settings())
     for action in ("undo", "sweep", "cut", "translucent", "mode", "cine_back", "cine_back", "cine_forth"):

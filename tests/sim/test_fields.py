@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from sim.fields import array_of, field_of, fields_of, fill
+from sim.fields import FieldSet, array_of, empty_fields, field_of, fields_of, fill
 
 
 @pytest.mark.parametrize("within", [0, 1, 2])
@@ -86,3 +86,16 @@ def test_fields_of_a_struct_are_read_separately(one_device, first):
     for name, wanted in values.items():
         assert np.array_equal(getattr(contact, name).to_numpy(), wanted)
         assert np.array_equal(array_of(getattr(contact, name)), wanted)
+
+
+def test_fields_of_a_set_are_freed_and_others_stay(device):
+    # Taichi holds 512 trees of fields.
+    kept = field_of(np.arange(6.0).reshape(2, 3), 1)
+    for number in range(700):
+        with FieldSet() as fields:
+            (vectors,), (numbers,) = empty_fields((5, 3), within=1), empty_fields((4,))
+        if number % 100 == 0:
+            fill((vectors, np.full((5, 3), float(number))), (numbers, np.full(4, -1.0)))
+            assert (array_of(vectors) == number).all() and (array_of(numbers) == -1.0).all()
+        fields.free()
+    assert np.array_equal(array_of(kept), np.arange(6.0).reshape(2, 3))
