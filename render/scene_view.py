@@ -55,9 +55,9 @@ class SceneView:
         self._probe_edges = transducer_shape.edges(*shape)
         self._edge_points = field_of(self._probe_edges, within=1)
         # Made when they are first drawn, and for other geometry only once.
-        self._plan: PlanLines | None = before._plan if before else None
-        self._score: ScoreLines | None = before._score if before else None
-        self._cut_face: CutFace | None = before._cut_face if before else None
+        self.plan_lines: PlanLines | None = before.plan_lines if before else None
+        self.score_lines: ScoreLines | None = before.score_lines if before else None
+        self.cut_face: CutFace | None = before.cut_face if before else None
         self._cut_side = 0.0
         self._plane = transducer_shape.image_plane_grid(PLANE_ROWS, PLANE_COLUMNS)
         self._plane_indices = transducer_shape.grid_triangles(PLANE_ROWS, PLANE_COLUMNS).reshape(-1)
@@ -103,11 +103,11 @@ class SceneView:
         if cut is not None:
             self._draw_inner(scene, inner, eye, key, ahead, cut)
         if view.guidance is not None:
-            self._plan = self._plan or PlanLines(self._probe_edges)
-            self._plan.draw(scene, view.guidance)
+            self.plan_lines = self.plan_lines or PlanLines(self._probe_edges)
+            self.plan_lines.draw(scene, view.guidance)
         if view.score is not None:
-            self._score = self._score or ScoreLines()
-            self._score.draw(scene, view.score, toward=-ahead)
+            self.score_lines = self.score_lines or ScoreLines()
+            self.score_lines.draw(scene, view.score, toward=-ahead)
         opacity = GLASS if settings.translucent else SOLID
         self._organ.tint(view.seen.get("organ"))
         self._organ.shade(eye, key, opacity, cut)
@@ -152,11 +152,11 @@ class SceneView:
     def _draw_cut_face(self, scene, view: View, inner: list[ShadedSurface], eye, key) -> Cut:
         """Draw the section and return the cut that removes the half before the eye."""
         self._cut_side = side_of_eye(view.transducer_pose, eye, self._cut_side)
-        self._cut_face = self._cut_face or CutFace()
+        self.cut_face = self.cut_face or CutFace()
         away, behind = self._cut_side * view.transducer_pose[:3, 1], np.array(view.transducer_pose)
         # The cut is shifted by half its soft edge, which must not be in front of the image.
         behind[:3, 3] -= CUT_EDGE_MM / 2 * away
-        self._cut_face.draw(scene, self._organ, inner, behind, key)
+        self.cut_face.draw(scene, self._organ, inner, behind, key)
         return behind[:3, 3], away
 
     def _draw_image_plane(self, scene, view: View, key: np.ndarray) -> None:
