@@ -261,7 +261,7 @@ def test_a_session_with_a_cut_replays_bit_for_bit_from_everywhere(patient, rehea
     report, digest = report_of(rehearsal), rehearsal.digest()
     recorder.close({})
     log = read_log(recorder.path)
-    for at_s in (0.0, 14 * step_s, 17 * step_s):
+    for at_s in (0.0, 17 * step_s):
         rehearsal.reset()
         replay = Replay(rehearsal, log)
         replay.begin_at(at_s)
@@ -290,13 +290,12 @@ def test_a_session_with_a_score_that_was_undone_replays_from_its_middle(patient,
     digest = rehearsal.digest()
     recorder.close({})
     log = read_log(recorder.path)
-    for at_s in (0.0, log.length_s - step_s):
-        rehearsal.reset()
-        replay = Replay(rehearsal, log)
-        replay.begin_at(at_s)
-        for _ in replay.go_to(log.length_s):
-            pass
-        assert replay.differs_s is None and rehearsal.digest() == digest
+    rehearsal.reset()
+    replay = Replay(rehearsal, log)
+    assert replay.begin_at(log.length_s - step_s) > 0
+    for _ in replay.go_to(log.length_s):
+        pass
+    assert replay.differs_s is None and rehearsal.digest() == digest
 
 
 def test_undo_of_a_cut_restores_friction_under_a_pressing_probe(rehearsal, marks):
