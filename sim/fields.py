@@ -28,7 +28,8 @@ def field_of(values: np.ndarray, within: int = 0) -> ti.Field:
 def fields_of(*arrays: np.ndarray, within: int = 0) -> list[ti.Field]:
     """``field_of`` for each array."""
     arrays = tuple(map(np.asarray, arrays))
-    fields = [_empty(values, within) for values in arrays]
+    kinds = [ti.f32 if values.dtype.kind == "f" else ti.i32 for values in arrays]
+    fields = _made([(values.shape, kind) for values, kind in zip(arrays, kinds, strict=True)], within)
     fill(*zip(fields, arrays, strict=True))
     return fields
 
@@ -63,17 +64,18 @@ class FieldSet:
 
 def empty_fields(*shapes: tuple[int, ...], within: int = 0, kind: type = ti.f32) -> list[ti.Field]:
     """Fields of these shapes, without values; as for ``field_of`` the last ``within`` axes are those of an element."""
+    return _made([(shape, kind) for shape in shapes], within)
+
+
+def _made(asked: Sequence[tuple[tuple[int, ...], type]], within: int) -> list[ti.Field]:
+    """Fields of these shapes and kinds, all in one tree where a set is entered."""
     make = (ti.field, ti.Vector.field, ti.Matrix.field)[within]
-    parts = [(shape[: len(shape) - within], shape[len(shape) - within :]) for shape in shapes]
+    parts = [(shape[: len(shape) - within], shape[len(shape) - within :], kind) for shape, kind in asked]
     if not _ENTERED:
-        return [make(*element, kind, outer) for outer, element in parts]
-    fields = [make(*element, kind) for _, element in parts]
-    _ENTERED[-1].add(fields, [outer for outer, _ in parts])
+        return [make(*element, kind, outer) for outer, element, kind in parts]
+    fields = [make(*element, kind) for _, element, kind in parts]
+    _ENTERED[-1].add(fields, [outer for outer, _, _ in parts])
     return fields
-
-
-def _empty(values: np.ndarray, within: int) -> ti.Field:
-    return empty_fields(values.shape, within=within, kind=ti.f32 if values.dtype.kind == "f" else ti.i32)[0]
 
 
 def fill(*pairs: tuple[ti.Field, np.ndarray]) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from sim.fields import empty_fields, fields_of, fill, run_kernel
+from sim.fields import fields_of, fill, run_kernel
 from sim.tissue_model import TissueModel
 
 
@@ -18,8 +18,8 @@ class Skin:
         self.points = np.asarray(points, np.float64)
         frame, weight = model.attach(self.points)
         self.model = model
-        self.vertices = empty_fields((len(points), 3), within=1)[0]
-        self.rest, self.frame, self.weight = fields_of(self.points, frame, weight, within=1)
+        given = self.points, self.points, frame, weight
+        self.vertices, self.rest, self.frame, self.weight = fields_of(*given, within=1)
         self.update()
 
     def attach_again(self) -> None:
