@@ -60,7 +60,7 @@ def tumour_anatomy(
         organ: with its tumours and cysts.
         tumour: of one tumour or several, apart from each other.
         parts: surfaces of other parts by tissue: sinus, urine (collecting system), vessel, cyst.
-        labels: voxels whose values ``tissues`` names; arteries and veins are told apart by them alone.
+        labels: voxels whose values ``tissues`` names; they alone distinguish arteries from veins.
         hilum_mm: a point at the hilum, for where no sinus is labelled.
     """
     bodies = sorted(tumour.split(only_watertight=False), key=lambda body: abs(body.volume))

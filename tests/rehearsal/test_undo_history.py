@@ -81,11 +81,11 @@ class Numbers:
 
     def advance(self, pose: np.ndarray) -> None:
         """Each step depends on the settings, the contacts, the divergence check's state, the marks and the cut."""
-        told = 1e-3 * self.young_kpa + 1e-2 * self.settings.iterations + 1e-3 * self.settings.gravity[2]
+        moved = 1e-3 * self.young_kpa + 1e-2 * self.settings.iterations + 1e-3 * self.settings.gravity[2]
         cut = self.resection.cut
-        told += 0.1 * len(self.resection.marks) + (0.0 if cut is None else 0.3 + 1e-3 * cut.nodes_mm.sum())
+        moved += 0.1 * len(self.resection.marks) + (0.0 if cut is None else 0.3 + 1e-3 * cut.nodes_mm.sum())
         drawn = self.contacts["plane"][:, :3] + 0.01 * (self.watch.steps_since_good % 7)
-        self.velocity = (0.9 * self.velocity + told + drawn + 0.01 * pose[:3, 3]).astype(np.float32)
+        self.velocity = (0.9 * self.velocity + moved + drawn + 0.01 * pose[:3, 3]).astype(np.float32)
         length_s = np.float32(self.settings.time_step_s)
         self.position = (0.99 * self.position + length_s * self.velocity).astype(np.float32)
         self.contacts = {"plane": np.sin(np.pad(self.position, ((0, 0), (0, 1))))}
