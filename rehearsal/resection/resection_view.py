@@ -98,7 +98,14 @@ class ResectionView:
         count = len(self.rehearsal.resection.marks)
         if count == 0 or self.rehearsal.cut is not None:
             return ""
-        parts = [f"SCORE {count} marks", settings.technique]
+        line = self.rehearsal.score
+        parts = [
+            f"SCORE {count} marks" + ("" if line is None else f" {line.length_mm:.0f} mm"),
+            settings.technique,
+        ]
+        if self.fault:
+            # The reason; what to do about it is said where a cut is refused.
+            parts.append(self.fault.partition(";")[0])
         if len(self.tumour_mm) and self.tumour_mm.min() < settings.margin_mm - TOLERANCE_MM:
             parts.append(f"{self.tumour_mm.min():.1f} of {settings.margin_mm:.0f} mm margin")
         return "   ".join(parts)

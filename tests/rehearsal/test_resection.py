@@ -373,6 +373,13 @@ def test_the_view_warns_of_a_line_that_is_too_near_and_shows_the_coming_cut(rehe
     # Between marks a geodesic may be nearer than they are, by the sagitta of their arc.
     assert distance_to_tumour(rehearsal).min() > MARGIN_MM - 0.5
     assert shown.score(MARGIN_MM + 2.0).is_near.all()
+    assert f"{rehearsal.score.length_mm:.0f} mm" in shown.status(CutSettings())
+    seen.seen[:] = False
+    shown.update(CutSettings(), seen.is_seen, 1.0)
+    assert "no part of the tumour was seen" in shown.status(CutSettings())
+    assert shown.section(np.eye(4)) is None
+    seen.seen[:] = True
+    shown.update(CutSettings(), seen.is_seen, 2.0)
     rehearsal.pose = touching_at(rehearsal, rehearsal.whole_tumour.center_mass)
     plane = rehearsal.image_plane()
     section = shown.section(np.linalg.inv(plane.world_from_plane))
