@@ -28,8 +28,8 @@ def import_request(
     seed_mm: np.ndarray | None = None,
     support: str = "mould",
     progress: Progress = silent,
-) -> tuple[Patient, set[str]]:
-    """The imported patient, and the identifiers that none of its files may contain.
+) -> tuple[Patient, dict[str, str]]:
+    """The imported patient, and the identifiers that none of its files may contain, with where each stands.
 
     Args:
         ct, labels: paths of the user.
@@ -64,11 +64,11 @@ def import_request(
         volume, merged, own, side, support=support, needed=set(tissues), progress=progress
     )
     notes = [note for segmentation in segmentations for note in segmentation.notes]
-    paths = {str(path.resolve()) for path in (ct, *labels)}
-    paths |= {str(path) for path in (ct, *labels) if len(path.parts) > 1}
-    identifiers = paths.union(
-        volume.identifiers, *(segmentation.identifiers for segmentation in segmentations)
-    )
+    paths = [str(path.resolve()) for path in (ct, *labels)]
+    paths += [str(path) for path in (ct, *labels) if len(path.parts) > 1]
+    identifiers = dict.fromkeys(paths, "the path of CT or labels") | dict(volume.identifiers)
+    for segmentation in segmentations:
+        identifiers |= segmentation.identifiers
     return replace(patient, notes=(*patient.notes, *notes), draft=seed_mm is not None), identifiers
 
 

@@ -114,7 +114,7 @@ def _file_per_organ(
     # Kidneys first: of the others only the part near them is read.
     near.sort(key=lambda file: tissue_of(_stem(file)) != "kidney")
     maps: list[LabelMap] = []
-    identifiers: set[str] = set()
+    identifiers: dict[str, str] = {}
     around: np.ndarray | None = None
     for file in progress(near, "labels"):
         volume = file_volume(file)
@@ -136,7 +136,7 @@ def _file_per_organ(
         raise PatientError(
             f"{folder}: all {len(near)} label files are empty; expected an organ; choose other labels"
         )
-    return Segmentation(lambda _: maps, identifiers=frozenset(identifiers))
+    return Segmentation(lambda _: maps, identifiers=identifiers)
 
 
 def _stem(path: Path) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import SimpleITK as sitk
@@ -91,7 +91,7 @@ class Segmentation:
     maps: Callable[[VoxelGrid], list[LabelMap]]  # on the CT's grid
     referenced: str = ""  # UID of the referenced series
     notes: tuple[str, ...] = ()
-    identifiers: frozenset[str] = frozenset()
+    identifiers: Mapping[str, str] = field(default_factory=dict)  # as those of ``LazyVolume``
     frame_of_reference: str = ""  # DICOM's UID
 
 
