@@ -7,7 +7,8 @@ import numpy as np
 
 from errors import PatientError
 from scenes.atomic_files import check_folder
-from scenes.patients.patient_folder import save_patient
+from scenes.import_findings import FINDINGS_FILE, findings_text
+from scenes.patients.patient_folder import save_patient, without_identifiers
 from scenes.patients.readers.segment_names import Side
 from scenes.scene import scene_text
 from scenes.terminal import bar, shell_command
@@ -73,14 +74,19 @@ def import_patient_command(
     # Matplotlib and highdicom take 0.5 s to import.
     from scenes.patients.check_picture import as_table, draw_check, summary_rows
     from scenes.patients.import_request import import_request
+    from scenes.patients.patient_findings import findings_of
     from scenes.patients.patient_scene import patient_scene
 
     tissues = {TISSUE_OPTIONS[o]: label_words(text, o) for o, text in words.items() if text is not None}
     own = [] if organ is None else label_words(organ, "organ")
     position = None if seed is None else position_mm(seed)
     patient, identifiers = import_request(ct, labels, own, tissues, side, series, position, support, bar)
+    patient = without_identifiers(patient, identifiers)
     rows = summary_rows(patient)
-    texts = {"scene.toml": scene_text(patient_scene(patient))}
+    texts = {
+        "scene.toml": scene_text(patient_scene(patient)),
+        FINDINGS_FILE: findings_text(findings_of(patient)),
+    }
     searched = save_patient(
         patient, out, texts, lambda folder: draw_check(patient, rows, folder), identifiers
     )

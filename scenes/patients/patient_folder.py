@@ -3,6 +3,7 @@
 import re
 import zlib
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -84,6 +85,15 @@ def _search(folder: Path, identifiers: Mapping[str, str]) -> int:
                     "else report this as a fault of the program"
                 )
     return len(wanted)
+
+
+def without_identifiers(patient: Patient, identifiers: Collection[str]) -> Patient:
+    """The patient with notes and warnings that name nobody."""
+    return replace(
+        patient,
+        notes=tuple(redacted(note, identifiers) for note in patient.notes),
+        warnings=tuple(redacted(warning, identifiers) for warning in patient.warnings),
+    )
 
 
 def redacted(text: str, identifiers: Collection[str]) -> str:

@@ -60,7 +60,8 @@ class Patient:
     side: Side
     volumes_ml: dict[str, float]  # of the labels: "organ" with all its parts, and each part
     overview: sitk.Image  # int16 [HU], the CT's full width at the organ's level, coarse; only for check.png
-    spacing_mm: tuple[float, float, float]  # of the CT's voxels along the image's own axes
+    source: VoxelGrid  # of the whole CT, before it was cropped
+    series: str = ""  # number of the CT's series
     notes: tuple[str, ...] = ()  # what was chosen, left out, resampled
     warnings: tuple[str, ...] = ()  # what looks wrong or was assumed
     colours: dict[str, Colour] = field(default_factory=dict)  # of organ and parts, where labels have one
@@ -137,7 +138,8 @@ def import_patient(
         side=actual_side,
         volumes_ml={"organ": piece.volume_ml, **{part: volumes[part] for part in parts}},
         overview=_overview(level, level_hu),
-        spacing_mm=tuple(grid.spacing.tolist()),
+        source=ct.grid,
+        series=ct.series,
         notes=ct.notes,
         warnings=warnings,
         colours=colours_of_labels(labels, [*parts]),

@@ -32,6 +32,7 @@ class LazyVolume:
     read_box: Callable[[Box], np.ndarray]  # voxels (z, y, x) of a box
     notes: tuple[str, ...] = ()  # for the user: what was chosen, left out or resampled
     frame_of_reference: str = ""  # DICOM's UID, where there is one
+    series: str = ""  # number of the DICOM series
     # Of the patient (PHI), and where each stands; no written file may contain them.
     identifiers: Mapping[str, str] = field(default_factory=dict)
     # Of a file's header, with the names of its labels.

@@ -1,5 +1,7 @@
 """The command import from end to end: what a hospital sends becomes a patient's folder that names nobody."""
 
+from dataclasses import replace
+
 import nibabel
 import numpy as np
 import pytest
@@ -11,9 +13,10 @@ from synthetic_body import BODY, DIRECTIONS, LEFT, RIGHT, TUMOUR, coarsely, leve
 from app import main
 from errors import PatientError
 from scenes.anatomy import load_anatomy
+from scenes.import_findings import read_findings
 from scenes.patients.import_command import position_mm
 from scenes.patients.import_request import import_request, volume_of_labels
-from scenes.patients.patient_folder import is_identifying, save_patient
+from scenes.patients.patient_folder import is_identifying, save_patient, without_identifiers
 from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import LabelMap
@@ -94,9 +97,31 @@ def test_the_folder_is_a_scene(written):
     held = scene.attachment
     assert held.at_mm is not None and held.radius_mm == 20 and held.stiffness_n_mm == 2.0
     assert {file.name for file in written.iterdir()} == {
-        "check.png", "ct.nrrd", "labels.nrrd", "organ.stl", "scene.toml", "support.stl", "tumour.stl",
+        "check.png", "ct.nrrd", "import.json", "labels.nrrd", "organ.stl", "scene.toml", "support.stl", "tumour.stl",
     }  # fmt: skip
     assert [entry.name for entry in written.parent.iterdir()] == ["a"]
+
+
+def test_the_findings_are_kept(written, taken_in):
+    patient, found = taken_in[0], read_findings(written)
+    assert found.side == "left" and found.series == "1" and not found.draft
+    assert found.source.size == SIZE and found.ct.size == patient.ct.GetSize()
+    np.testing.assert_allclose(found.source.origin_mm, ORIGIN, atol=1e-3)
+    assert found.surfaces["organ"].label_ml == pytest.approx(patient.volumes_ml["organ"], abs=1e-3)
+    assert found.surfaces["tumour"].volume_ml == pytest.approx(patient.tumour.volume / 1000, abs=1e-3)
+    assert found.complexity["tumours"] == 1
+    assert list(found.open_warnings) == list(patient.warnings) and found.notes == patient.notes
+
+
+def test_notes_name_nobody(taken_in):
+    """Notes quote names of files and labels."""
+    names = dict.fromkeys(["Doe^Jane", "Doe", "Jane", "1.2.840.4711"], "")
+    patient = replace(
+        taken_in[0], notes=("slice 3 (doe_jane/IM1)", "of Doe^Jane"), warnings=("label 1.2.840.4711.dcm",)
+    )
+    found = without_identifiers(patient, names)
+    assert found.notes == ("slice 3 ([removed]_[removed]/IM1)", "of [removed]")
+    assert found.warnings == ("label [removed].dcm",)
 
 
 def test_nothing_names_the_patient(written, hospital):

@@ -91,6 +91,7 @@ def _series_volume(
         stack,
         notes=(*notes, *stack.notes),
         frame_of_reference=series.frame_of_reference,
+        series=series.number,
         identifiers=identifiers_of(slices[0].item),
     )
 
