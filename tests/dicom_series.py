@@ -302,15 +302,26 @@ def write_segmentation(
 
 
 def write_structures(
-    path: Path, regions: dict[str, list[np.ndarray]], series_uid: str = "", kind: str = "CLOSED_PLANAR"
+    path: Path,
+    regions: dict[str, list[np.ndarray]],
+    series_uid: str = "",
+    kind: str = "CLOSED_PLANAR",
+    frame_of_reference: str = "",
+    sops: Iterable[str] = (),
+    edit: Callable[[FileDataset], None] = lambda data: None,
 ) -> Path:
-    """An RTSTRUCT of closed contours (n, 3) in LPS by the names of their regions."""
+    """An RTSTRUCT of closed contours (n, 3) in LPS by the names of their regions, and the CT that it refers to."""
     data = _file(RTStructureSetStorage, generate_uid(), ImplicitVRLittleEndian)
     data.Modality, data.SeriesInstanceUID, data.SeriesNumber = "RTSTRUCT", generate_uid(), 9
     data.StudyInstanceUID = generate_uid()
-    if series_uid:
+    if series_uid or frame_of_reference or sops:
         frame, study, referenced = Dataset(), Dataset(), Dataset()
-        referenced.SeriesInstanceUID = series_uid
+        if frame_of_reference:
+            frame.FrameOfReferenceUID = frame_of_reference
+        if series_uid:
+            referenced.SeriesInstanceUID = series_uid
+        referenced.ContourImageSequence = [_reference(sop) for sop in sops]
+        study.ReferencedSOPInstanceUID = generate_uid()
         study.RTReferencedSeriesSequence = [referenced]
         frame.RTReferencedStudySequence = [study]
         data.ReferencedFrameOfReferenceSequence = [frame]
@@ -318,6 +329,8 @@ def write_structures(
     for number, (name, contours) in enumerate(regions.items(), start=1):
         roi, drawn = Dataset(), Dataset()
         roi.ROINumber, roi.ROIName = number, name
+        if frame_of_reference:
+            roi.ReferencedFrameOfReferenceUID = frame_of_reference
         drawn.ReferencedROINumber, drawn.ROIDisplayColor, drawn.ContourSequence = number, [255, 0, 51], []
         for points in contours:
             contour = Dataset()
@@ -326,4 +339,11 @@ def write_structures(
             drawn.ContourSequence.append(contour)
         data.StructureSetROISequence.append(roi)
         data.ROIContourSequence.append(drawn)
+    edit(data)
     return save(data, path)
+
+
+def _reference(sop: str) -> Dataset:
+    one = Dataset()
+    one.ReferencedSOPClassUID, one.ReferencedSOPInstanceUID = CTImageStorage, sop
+    return one

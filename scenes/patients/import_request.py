@@ -15,6 +15,7 @@ from scenes.patients.readers.label_maps import assign_tissues, merge_label_maps
 from scenes.patients.readers.segment_names import Side
 from scenes.patients.region_growing import draft_segmentation
 from scenes.terminal import Progress, silent
+from scenes.volumes.dicom_references import NO_REFERENCES, doubts, mismatch
 from scenes.volumes.lazy_volume import LazyVolume
 
 
@@ -89,13 +90,16 @@ def _segmentations(
 def volume_of_labels(
     ct: Path, segmentations: list[Segmentation], series: str | None = None, progress: Progress = silent
 ) -> LazyVolume:
-    """The CT that the labels were drawn on. Raises PatientError where they have another frame of reference."""
-    referenced = next((found.referenced for found in segmentations if found.referenced), "")
-    volume = open_ct(ct, series, referenced, progress)
+    """The CT that the labels were drawn on. Raises PatientError where they belong to another."""
+    labels = next((s.references for s in segmentations if s.references != NO_REFERENCES), NO_REFERENCES)
+    grid = next((s.grid for s in segmentations if s.grid), None)
+    volume = open_ct(ct, series, labels, grid, progress)
     for segmentation in segmentations:
-        if len({segmentation.frame_of_reference, volume.frame_of_reference} - {""}) > 1:
+        fault = mismatch(segmentation.references, volume.references)
+        if fault:
             raise PatientError(
-                f"{ct}: the labels have another frame of reference than this series; expected the CT that they "
-                "were drawn on; choose it with --series, or give its folder"
+                f"{ct}: the labels {fault} this CT series; expected the CT that they were drawn on; choose it with --series, or give "
+                "its folder"
             )
-    return volume
+    found = [note for s in segmentations for note in doubts(s.references, volume.references)]
+    return replace(volume, notes=(*volume.notes, *dict.fromkeys(found)))

@@ -11,6 +11,7 @@ import psutil
 import SimpleITK as sitk
 
 from errors import PatientError
+from scenes.volumes.dicom_references import NO_REFERENCES, DicomReferences
 from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 AIR_HU = -1000
@@ -31,7 +32,7 @@ class LazyVolume:
     grid: VoxelGrid
     read_box: Callable[[Box], np.ndarray]  # voxels (z, y, x) of a box
     notes: tuple[str, ...] = ()  # for the user: what was chosen, left out or resampled
-    frame_of_reference: str = ""  # DICOM's UID, where there is one
+    references: DicomReferences = NO_REFERENCES  # the DICOM objects that it consists of
     series: str = ""  # number of the DICOM series
     # Of the patient (PHI), and where each stands; no written file may contain them.
     identifiers: Mapping[str, str] = field(default_factory=dict)

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from synthetic_body import DIRECTIONS
 
 from scenes.patients.readers.ct_series import open_ct
+from scenes.volumes.dicom_references import DicomReferences
 
 SHUFFLED = (3, 0, 5, 1, 4, 2)
 TILT = 18.0
@@ -178,7 +179,7 @@ class TestChoice:
         assert_whole(thick, tmp_path, series="8")
         assert_whole(thick, tmp_path, series=thick.uid[-8:])
         assert_whole(thick, tmp_path, series=thick.uid)
-        assert_whole(thick, tmp_path, referenced=thick.uid)
+        assert_whole(thick, tmp_path, labels=DicomReferences(series=frozenset({thick.uid})))
         words = refusal(tmp_path, series="5")
         assert "--series 5 is no series" in words and "series 3" in words and "series 8" in words
 

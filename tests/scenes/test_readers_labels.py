@@ -235,7 +235,7 @@ class TestSegmentations:
         assert all(np.array_equal(found[name], mask) for name, mask in masks.items())
         segments = [s for one in maps for s in one.segments.values()]
         assert [(s.value, s.tissue, s.side) for s in segments] == [(1, "kidney", "left"), (2, "tumour", None)]
-        assert drawing.referenced == series.uid
+        assert drawing.references.series == {series.uid}
         assert any("50%" in note for note in drawing.notes) == (kind == "FRACTIONAL")
 
     def test_shares(self, tmp_path):
@@ -295,7 +295,7 @@ class TestContours:
         rings = [ring(m, r, series.direction) for m in middles for r in (self.OUTER, self.INNER)]
         path = write_structures(tmp_path / "rt.dcm", {"Kidney R": rings, "GTV": rings[:2]}, series.uid)
         drawing = open_labels(path)
-        assert drawing.referenced == series.uid
+        assert drawing.references.series == {series.uid}
         kidney, mass = drawing.maps(open_ct(tmp_path / "ct").grid)
         assert kidney.segments == {1: Segment("Kidney R", 1, "kidney", "right", (1.0, 0.0, 0.2))}
         assert mass.segments[1].tissue == "tumour" and mass.values.any(axis=(1, 2)).sum() == 1

@@ -1,28 +1,98 @@
-"""Open a CT: a volume file, or one series of DICOM files."""
+"""Open a CT: a volume file, or one series of DICOM files; or list what a path has."""
 
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from errors import PatientError
-from scenes.patients.readers.dicom_files import find_dicom_files
+from scenes.patients.readers.dicom_files import SourceFile, find_dicom_files
 from scenes.patients.readers.dicom_headers import DicomContents, DicomSlice, Series, read_headers
 from scenes.patients.readers.identifiers import identifiers_of
+from scenes.patients.readers.label_headers import label_header
+from scenes.patients.readers.series_choice import (
+    UID_END,
+    choose_series,
+    gap_mm,
+    in_order,
+    orientation,
+    patient_numbers,
+    series_of_labels,
+)
 from scenes.patients.readers.slice_stack import stack_slices
 from scenes.terminal import Progress, silent
+from scenes.volumes.dicom_references import NO_REFERENCES, DicomReferences
 from scenes.volumes.lazy_volume import LazyVolume
 from scenes.volumes.volume_files import ENDINGS, file_volume, is_volume_file
+from scenes.volumes.voxel_grid import VoxelGrid
 
 # Up to this share of slices in another view are taken for unmarked localizers.
 STRAY = 0.1
-# Characters of a UID that identify a series; series numbers are shorter.
-UID_END = 6
+
+
+@dataclass(frozen=True)
+class SeriesRow:
+    """One CT of a path, for the user: without any name, ID or date."""
+
+    number: str  # of the series; "" of a volume file
+    uid_end: str  # what tells series of one number apart, else ""
+    slices: int
+    spacing_mm: float | None  # between slices; None where all are at one position
+    pixel_mm: tuple[float, float] | None  # along rows and columns; None without a slice
+    extent_mm: float  # along the body, from the foot to the head
+    orientation: str  # axial, coronal, sagittal, oblique; "" without a slice
+    patient: int  # 1, 2, ...
+    fault: str  # why it cannot be imported; "" where it is complete
+
+
+@dataclass(frozen=True)
+class LabelsRow:
+    """One DICOM segmentation or structure set of a path, for the user."""
+
+    kind: str  # SEG or RTSTRUCT
+    file: str  # relative to the path
+    segments: tuple[str, ...]  # their names
+    series: tuple[str, ...]  # numbers of the CT series in the path that it refers to
+    patient: int | None  # as in the series' rows; None: of none of them
+    fault: str  # why its header cannot be read, else ""
+
+
+@dataclass(frozen=True)
+class CtListing:
+    """What a path has to import."""
+
+    series: list[SeriesRow]  # by number
+    labels: list[LabelsRow]  # by file
+
+
+def list_ct(path: Path, progress: Progress = silent) -> CtListing:
+    """The CT series and DICOM labels of a path as for ``open_ct``, from their headers.
+
+    A path with labels but without a CT has no series. Raises PatientError: not readable, or neither CT nor labels.
+    """
+    if not path.exists():
+        raise PatientError(f"{path}: no such file or folder; check the path")
+    if path.is_file() and is_volume_file(path):
+        return CtListing([_row_of_file(file_volume(path))], [])
+    found = read_dicom_headers(path, progress)
+    candidates = in_order(found.candidates if found.labels else ct_candidates(path, found))
+    patients = patient_numbers(candidates)
+    numbers = [s.number for s in candidates]
+    rows = [
+        _row_of_series(path, s, patient, numbers.count(s.number) > 1)
+        for s, patient in zip(candidates, patients, strict=True)
+    ]
+    return CtListing(rows, [_row_of_labels(kind, item, candidates, patients) for kind, item in found.labels])
 
 
 def open_ct(
-    path: Path, series: str | None = None, referenced: str = "", progress: Progress = silent
+    path: Path,
+    series: str | None = None,
+    labels: DicomReferences = NO_REFERENCES,
+    grid: VoxelGrid | None = None,
+    progress: Progress = silent,
+    found: DicomContents | None = None,
 ) -> LazyVolume:
     """Find a CT and read its headers; voxels are read on demand.
 
@@ -30,7 +100,10 @@ def open_ct(
         path: a folder with DICOM files, in subfolders too; a DICOMDIR; a zip archive of DICOM files; an enhanced CT;
             a .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd file.
         series: number or UID (or its end) of one of several series.
-        referenced: UID of the series that the labels refer to, which is preferred.
+        labels: what the labels refer to; their series is preferred.
+        grid: the labels' own voxels, where they are a label map.
+        progress: shows the progress of headers and slices.
+        found: the headers of the path, where they have been read.
 
     Raises:
         PatientError: not readable, or not one complete CT.
@@ -41,7 +114,12 @@ def open_ct(
         if series is not None:
             raise PatientError(f"{path}: has no series; leave --series out")
         return file_volume(path)
-    return _series_volume(path, read_dicom_headers(path, progress), series, referenced, progress)
+    found = found or read_dicom_headers(path, progress)
+    chosen, notes = choose_series(path, ct_candidates(path, found), series, labels, grid)
+    if found.others:
+        notes.append(f"left out, no CT slices: {', '.join(_counted(found.others))}")
+    volume = _series_volume(path, chosen, progress)
+    return replace(volume, notes=(*notes, *volume.notes))
 
 
 def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
@@ -59,19 +137,17 @@ def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
     return read_headers(items, lambda files: progress(files, "headers"))
 
 
-def _series_volume(
-    path: Path, found: DicomContents, wanted: str | None, referenced: str, progress: Progress
-) -> LazyVolume:
-    """The CT of one series: the ``wanted`` one by number or UID, else the ``referenced`` one, else the best.
-
-    Raises PatientError: no CT, no such series, or an incomplete one.
-    """
-    candidates = [s for s in found.series.values() if s.slices or s.faults]
-    if not candidates:
+def ct_candidates(path: Path, found: DicomContents) -> list[Series]:
+    """All series with CT slices, also damaged ones. Raises PatientError where there are none."""
+    if not found.candidates:
         raise PatientError(
             f"{path}: {_contents_without_ct(found)}; expected a CT; give the folder of a CT series"
         )
-    series, notes = choose_series(path, candidates, wanted, referenced)
+    return found.candidates
+
+
+def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume:
+    """The CT of one series. Raises PatientError where it is incomplete."""
     if series.faults:
         more = len(series.faults) - 1
         fault = series.faults[0].removeprefix(f"{path.name}: ")
@@ -80,19 +156,67 @@ def _series_volume(
             "export the series again"
         )
     slices, left_out = _one_view(series)
+    notes = []
     if series.localizers + left_out:
         notes.append(f"left out, localisers: {series.localizers + left_out}")
-    if found.others:
-        notes.append(f"left out, no CT slices: {', '.join(_counted(found.others))}")
     if not all(one.is_rescaled for one in slices):
         notes.append("the files have no rescale: their values were taken as HU")
     stack = stack_slices(str(path), slices, lambda files: progress(files, "slices"))
     return replace(
         stack,
         notes=(*notes, *stack.notes),
-        frame_of_reference=series.frame_of_reference,
+        references=series.references,
         series=series.number,
         identifiers=identifiers_of(slices[0].item),
+    )
+
+
+def _row_of_file(volume: LazyVolume) -> SeriesRow:
+    grid = volume.grid
+    x, y, spacing = grid.spacing.tolist()
+    return SeriesRow(
+        number="",
+        uid_end="",
+        slices=grid.size[2],
+        spacing_mm=spacing,
+        pixel_mm=(x, y),
+        extent_mm=float(np.ptp(grid.corners()[:, 2])),
+        orientation=orientation(grid.direction[:, 2]),
+        patient=1,
+        fault="",
+    )
+
+
+def _row_of_series(path: Path, series: Series, patient: int, with_uid: bool) -> SeriesRow:
+    fault = ""
+    try:
+        _series_volume(path, series, silent)
+    except PatientError as error:
+        fault = str(error).removeprefix(f"{path}: ")
+    first = series.slices[0] if series.slices else None
+    return SeriesRow(
+        number=series.number,
+        uid_end=series.uid[-UID_END:] if with_uid else "",
+        slices=len(series.slices),
+        spacing_mm=gap_mm(series),
+        pixel_mm=first.spacing if first else None,
+        extent_mm=float(np.ptp([one.heights_mm for one in series.slices])) if first else 0.0,
+        orientation=orientation(first.normal) if first else "",
+        patient=patient,
+        fault=fault,
+    )
+
+
+def _row_of_labels(kind: str, item: SourceFile, candidates: list[Series], patients: list[int]) -> LabelsRow:
+    try:
+        header = label_header(kind, item)
+    except PatientError as error:
+        return LabelsRow(kind, item.name, (), (), None, str(error))
+    theirs = series_of_labels(candidates, header.references)
+    related = theirs or [s for s in candidates if s.patient and s.patient == header.references.patient]
+    of = {patient for s, patient in zip(candidates, patients, strict=True) if s in related}
+    return LabelsRow(
+        kind, item.name, header.names, tuple(s.number for s in theirs), of.pop() if len(of) == 1 else None, ""
     )
 
 
@@ -104,62 +228,6 @@ def _contents_without_ct(found: DicomContents) -> str:
     localizers = Counter(localisers=sum(series.localizers for series in found.series.values()))
     kinds = _counted(found.others) + _counted(Counter(kind for kind, _ in found.labels) + localizers)
     return f"no CT slices, but {', '.join(kinds)}" if kinds else "no CT slices"
-
-
-def choose_series(
-    path: Path, candidates: list[Series], wanted: str | None, referenced: str
-) -> tuple[Series, list[str]]:
-    """The chosen series, and a note with the reason where there are several. Raises PatientError."""
-    ranked = sorted(candidates, key=lambda s: _rank(s, referenced), reverse=True)
-    numbers = [s.number for s in candidates]
-    listed = "; ".join(
-        _described(s, numbers.count(s.number) > 1)
-        for s in sorted(candidates, key=lambda s: (len(s.number), s.number))
-    )
-    if wanted is not None:
-        matching = [
-            s for s in candidates if s.number == wanted or (len(wanted) >= UID_END and s.uid.endswith(wanted))
-        ]
-        if len(matching) != 1:
-            what = "no series" if not matching else f"{len(matching)} series"
-            raise PatientError(
-                f"{path}: --series {wanted} is {what}; expected the number of one of these, or the end of its UID: {listed}"
-            )
-        return matching[0], []
-    best = ranked[0]
-    if len(candidates) == 1:
-        return best, []
-    why = "it covers most of the body with the thinnest slices"
-    if best.uid == referenced:
-        why = "the labels refer to it"
-    elif _rank(best, "")[:-1] == _rank(ranked[1], "")[:-1]:
-        why = "of several equal ones the lowest number"
-    return best, [
-        f"of {len(candidates)} series, number {best.number} was taken: {why}; there are: {listed}; --series N takes another"
-    ]
-
-
-def _rank(series: Series, referenced: str) -> tuple:
-    """Sort key, larger is better: referenced by labels, usable, axial, extent in steps of 5 cm, number of slices."""
-    along = [one.along_mm for one in series.slices] or [0.0]
-    axial = bool(series.slices) and abs(series.slices[0].normal[2]) > 0.9
-    number = float(series.number) if series.number.isdecimal() else 1e9
-    return (
-        series.uid == referenced,
-        not series.faults and len(series.slices) > 1,
-        axial,
-        round((max(along) - min(along)) / 50),
-        len(series.slices),
-        -number,
-    )
-
-
-def _described(series: Series, with_uid: bool) -> str:
-    """Number, slices and spacing, and if needed the end of the UID; no free text, which may name the patient."""
-    places = np.unique([round(one.along_mm, 2) for one in series.slices])
-    gap = f", {np.median(np.diff(places)):.2f} mm apart" if len(places) > 1 else ""
-    uid = f", UID ends in {series.uid[-UID_END:]}" if with_uid else ""
-    return f"series {series.number} (CT, {len(series.slices)} slices{gap}{uid})"
 
 
 def _one_view(series: Series) -> tuple[list[DicomSlice], int]:

@@ -11,6 +11,7 @@ from pydicom.dataset import Dataset
 
 from errors import PatientError, parsing
 from scenes.patients.readers.dicom_files import DAMAGED, SourceFile
+from scenes.volumes.dicom_references import DicomReferences
 
 CT_CLASSES = {
     "1.2.840.10008.5.1.4.1.1.2",
@@ -29,8 +30,11 @@ TAGS = [
     "ImageType", "FrameOfReferenceUID", "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing",
     "Rows", "Columns", "NumberOfFrames", "RescaleSlope", "RescaleIntercept", "RescaleType",
     "PixelPaddingValue", "PixelPaddingRangeLimit", "BurnedInAnnotation", "SamplesPerPixel",
-    "SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence",
+    "SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence", "PatientID", "StudyInstanceUID",
 ]  # fmt: skip
+IDENTIFYING = (
+    "SOPClassUID", "Modality", "SeriesInstanceUID", "SeriesNumber", "FrameOfReferenceUID", "PatientID", "StudyInstanceUID",
+)  # fmt: skip
 MODALITY = re.compile("[A-Z]{2,8}")
 LOCALIZERS = {"LOCALIZER", "SCOUT", "TOPOGRAM"}
 # Values of ImageType whose pixels are not HU.
@@ -70,21 +74,42 @@ class DicomSlice:
         return float(self.position @ self.normal)
 
     @property
+    def heights_mm(self) -> np.ndarray:
+        """(4,) LPS z of its corners: how far it reaches along the body."""
+        across, down = (
+            n * step for n, step in zip((self.columns - 1, self.rows - 1), self.spacing, strict=True)
+        )
+        return (
+            self.position[2]
+            + np.array([0, across, 0, across]) * self.row[2]
+            + np.array([0, 0, down, down]) * self.column[2]
+        )
+
+    @property
     def label(self) -> str:
         """Its name in errors."""
         return f"slice {'without a number' if self.number is None else self.number} ({self.item.name})"
 
 
-@dataclass
+@dataclass(eq=False)
 class Series:
-    """The slices of one SeriesInstanceUID, in file order."""
+    """The slices of one SeriesInstanceUID, in file order. The UIDs and the ID are the patient's (PHI), and are never shown."""
 
     uid: str
     number: str
+    patient: str = ""  # PatientID
+    study: str = ""
     frame_of_reference: str = ""
     slices: list[DicomSlice] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)  # a line for each slice that cannot be used
     localizers: int = 0
+
+    @property
+    def references(self) -> DicomReferences:
+        """The objects that it consists of."""
+        frames, series = ({uid} - {""} for uid in (self.frame_of_reference, self.uid))
+        slices = {one.sop for one in self.slices} - {""}
+        return DicomReferences(frozenset(frames), frozenset(series), frozenset(slices), self.patient)
 
 
 @dataclass
@@ -95,6 +120,11 @@ class DicomContents:
     labels: list[tuple[str, SourceFile]] = field(default_factory=list)  # SEG or RTSTRUCT, and the file
     others: Counter[str] = field(default_factory=Counter)  # of each modality, other files
 
+    @property
+    def candidates(self) -> list[Series]:
+        """All series with CT slices, also damaged ones."""
+        return [series for series in self.series.values() if series.slices or series.faults]
+
 
 def read_headers(
     items: list[SourceFile], progress: Callable[[Iterable[SourceFile]], Iterable[SourceFile]] = iter
@@ -104,24 +134,19 @@ def read_headers(
     for item in progress(items):
         header = item.header(TAGS)
         with parsing(f"{item.name}: a damaged DICOM file", DAMAGED):
-            sop_class, modality, uid, number, frame = (
-                str(header.get(name) or "")
-                for name in (
-                    "SOPClassUID",
-                    "Modality",
-                    "SeriesInstanceUID",
-                    "SeriesNumber",
-                    "FrameOfReferenceUID",
-                )
+            sop_class, modality, uid, number, frame, patient, study = (
+                str(header.get(name) or "").strip() for name in IDENTIFYING
             )
             is_directory = header.file_meta.get("MediaStorageSOPClassUID", "") == MEDIA_DIRECTORY
         if sop_class in LABEL_CLASSES:
             found.labels.append((LABEL_CLASSES[sop_class], item))
         elif sop_class in CT_CLASSES:
             named = number if number.isdecimal() else "without a number"
-            series = found.series.setdefault(uid, Series(uid, named))
+            series = found.series.setdefault(uid, Series(uid, named, patient, study))
             series.frame_of_reference = frame
             try:
+                if patient != series.patient:
+                    raise PatientError(f"{item.name}: is of another patient than the files before it")
                 slices = slices_of(item, header)
                 series.slices += [one for one in slices if one is not None]
                 series.localizers += slices.count(None)

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import highdicom as hd
 import numpy as np
-from pydicom.dataset import Dataset
 
 from errors import PatientError, parsing
 from scenes.patients.readers.dicom_files import SourceFile
 from scenes.patients.readers.dicom_headers import TAGS, slices_of
 from scenes.patients.readers.identifiers import identifiers_of
+from scenes.patients.readers.label_headers import references_of
 from scenes.patients.readers.label_maps import LabelMap, Segment, Segmentation
 from scenes.patients.readers.segment_names import tissue_of
 from scenes.patients.readers.slice_stack import stack_slices
@@ -37,13 +37,11 @@ def read_segmentation(item: SourceFile) -> Segmentation:
             f"{item.name}: is empty, no voxel is labelled; expected an organ; choose another file"
         )
     fractional = segmentation.segmentation_type == hd.seg.SegmentationTypeValues.FRACTIONAL
-    series = data.get("ReferencedSeriesSequence") or [Dataset()]
     return Segmentation(
         lambda _: maps,
-        referenced=str(series[0].get("SeriesInstanceUID", "")),
         notes=(f"fractional segments were cut at {HALF:.0%}",) * fractional,
         identifiers=identifiers_of(item),
-        frame_of_reference=str(data.get("FrameOfReferenceUID") or ""),
+        references=references_of(data),
     )
 
 

@@ -80,7 +80,7 @@ def _label_map_file(path: Path) -> Segmentation:
     if not names and len(maps[0].segments) == len(maps) == 1 and (tissue_of(stem) or side_of(stem)):
         (value,) = maps[0].segments
         maps = [replace(maps[0], segments={value: Segment.named(stem, value)})]
-    return Segmentation(lambda _: maps, identifiers=volume.identifiers)
+    return Segmentation(lambda _: maps, identifiers=volume.identifiers, grid=volume.grid)
 
 
 def _names(volume: LazyVolume) -> dict[tuple[int, int], Segment]:
@@ -136,7 +136,7 @@ def _file_per_organ(
         raise PatientError(
             f"{folder}: all {len(near)} label files are empty; expected an organ; choose other labels"
         )
-    return Segmentation(lambda _: maps, identifiers=identifiers)
+    return Segmentation(lambda _: maps, identifiers=identifiers, grid=volume.grid)
 
 
 def _stem(path: Path) -> str:

@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from errors import PatientError
 from scenes.patients.readers.segment_names import Side, side_of, tissue_of
+from scenes.volumes.dicom_references import NO_REFERENCES, DicomReferences
 from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 # Of overlapping segments, later tissues cover earlier ones: small structures cover their surroundings.
@@ -89,10 +90,10 @@ class Segmentation:
     """Labels of one source; contours are filled once the CT's grid is known."""
 
     maps: Callable[[VoxelGrid], list[LabelMap]]  # on the CT's grid
-    referenced: str = ""  # UID of the referenced series
     notes: tuple[str, ...] = ()
     identifiers: Mapping[str, str] = field(default_factory=dict)  # as those of ``LazyVolume``
-    frame_of_reference: str = ""  # DICOM's UID
+    references: DicomReferences = NO_REFERENCES  # the DICOM objects that they refer to
+    grid: VoxelGrid | None = None  # of label maps: all voxels of the first
 
 
 def listed(names: Sequence[str]) -> str:

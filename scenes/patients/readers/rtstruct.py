@@ -1,7 +1,5 @@
 """Read the contours of a DICOM RTSTRUCT and fill them on their planes."""
 
-import contextlib
-
 import numpy as np
 from pydicom.dataset import Dataset
 from skimage.draw import polygon
@@ -9,6 +7,7 @@ from skimage.draw import polygon
 from errors import PatientError, parsing
 from scenes.patients.readers.dicom_files import SourceFile
 from scenes.patients.readers.identifiers import identifiers_of
+from scenes.patients.readers.label_headers import references_of
 from scenes.patients.readers.label_maps import LabelMap, Segment, Segmentation
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -27,10 +26,6 @@ def read_structures(item: SourceFile) -> Segmentation:
             for roi in data.ROIContourSequence
             for number in [int(roi.ReferencedROINumber)]
         ]
-    referenced = ""
-    with contextlib.suppress(Exception):  # without it the best series is taken
-        study = data.ReferencedFrameOfReferenceSequence[0].RTReferencedStudySequence[0]
-        referenced = str(study.RTReferencedSeriesSequence[0].SeriesInstanceUID)
 
     def maps(ct: VoxelGrid) -> list[LabelMap]:
         filled = [(*_filled(item.name, contours, ct), segment) for segment, contours in regions if contours]
@@ -41,7 +36,7 @@ def read_structures(item: SourceFile) -> Segmentation:
             )
         return found
 
-    return Segmentation(maps, referenced, identifiers=identifiers_of(item))
+    return Segmentation(maps, identifiers=identifiers_of(item), references=references_of(data))
 
 
 def _colour(roi: Dataset) -> tuple[float, float, float] | None:
