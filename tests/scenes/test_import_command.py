@@ -297,6 +297,18 @@ def test_identifiers_of_labels_and_paths(hospital, taken_in, tmp_path, monkeypat
     }
 
 
+def test_a_value_that_no_voxel_has_is_noted(hospital, taken_in, tmp_path, monkeypatch):
+    monkeypatch.setattr("scenes.patients.import_request.import_patient", lambda *_, **__: taken_in[0])
+    sitk.WriteImage(sitk.Image([5, 5, 5], sitk.sitkUInt8) + 1, str(tmp_path / "kits.nii.gz"))
+    patient, _ = import_request(
+        hospital[0] / "ct", [tmp_path / "kits.nii.gz"], ["1", "2"], {"tumour": ["2"], "cyst": ["3"]}
+    )
+    assert patient.notes[-2:] == (
+        "no voxel has the tumour's label 2",
+        "no voxel has the cyst's label 3",
+    )
+
+
 def test_a_seed_makes_a_draft(hospital, taken_in, monkeypatch):
     labels = LabelMap.of(sitk.Image([4, 4, 4], sitk.sitkUInt8) + 1)
     monkeypatch.setattr("scenes.patients.import_request.draft_segmentation", lambda ct, seed: labels)

@@ -31,7 +31,7 @@ def read_segmentation(item: SourceFile) -> Segmentation:
         "expected evenly spaced frames in the patient's coordinates; export it as a label map, for example NRRD",
     ):
         segmentation = hd.seg.Segmentation.from_dataset(data, copy=False)
-        maps = _maps(item, segmentation)
+        maps, empty = _maps(item, segmentation)
     if not maps:
         raise PatientError(
             f"{item.name}: is empty, no voxel is labelled; expected an organ; choose another file"
@@ -42,17 +42,19 @@ def read_segmentation(item: SourceFile) -> Segmentation:
         notes=(f"fractional segments were cut at {HALF:.0%}",) * fractional,
         identifiers=identifiers_of(item),
         references=references_of(data),
+        empty=tuple(empty),
     )
 
 
-def _maps(item: SourceFile, segmentation: hd.seg.Segmentation) -> list[LabelMap]:
+def _maps(item: SourceFile, segmentation: hd.seg.Segmentation) -> tuple[list[LabelMap], list[Segment]]:
+    """The map of each segment that has voxels, and the other segments."""
     if segmentation.get("FrameOfReferenceUID") is None:
         raise PatientError(
             f"{item.name}: has no frame of reference, so it belongs to no volume; expected labels of a CT; choose another file"
         )
     is_upright = segmentation.get_volume_geometry(allow_missing_positions=True) is not None
     read = _upright if is_upright else _tilted
-    maps = []
+    maps, empty = [], []
     for number in segmentation.segment_numbers:
         if number == 0:  # background
             continue
@@ -63,7 +65,9 @@ def _maps(item: SourceFile, segmentation: hd.seg.Segmentation) -> list[LabelMap]
         grid, inside = read(item, segmentation, int(number))
         if inside.any():
             maps.append(LabelMap.single(grid, inside, segment))
-    return maps
+        else:
+            empty.append(segment)
+    return maps, empty
 
 
 def _upright(
