@@ -28,9 +28,8 @@ LABEL = "Names or values of the labels"
 @click.command("import")
 @click.argument("ct", type=click.Path(path_type=Path))
 @click.argument("labels", type=click.Path(path_type=Path), nargs=-1)
-@click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="Folder to write to; new or empty."
-)
+@click.option("--out", type=click.Path(path_type=Path), help="Folder to write to; new or empty.")
+@click.option("--list", "lists", is_flag=True, help="List series and labels, and make nothing.")
 @click.option(
     "--organ", help=f"{LABEL} that are the organ, such as 1,2 [named as a kidney; without names, all]."
 )
@@ -55,7 +54,8 @@ LABEL = "Names or values of the labels"
 def import_patient_command(
     ct: Path,
     labels: tuple[Path, ...],
-    out: Path,
+    out: Path | None,
+    lists: bool,
     organ: str | None,
     side: Side | None,
     series: str | None,
@@ -70,6 +70,13 @@ def import_patient_command(
     CT: a folder with DICOM, a DICOMDIR or zip archive, a NIfTI, NRRD or MHA file. LABELS: label maps, a folder with one
     file per organ, DICOM-SEG, RTSTRUCT; by default the segmentation in the CT's folder.
     """
+    if lists:
+        from scenes.patients.import_listing import listing_text
+
+        click.echo(listing_text(ct, labels, bar))
+        return
+    if out is None:
+        raise click.UsageError("--out: expected a folder to write to, or --list to see what there is")
     check_folder(out)
     # Matplotlib and highdicom take 0.5 s to import.
     from scenes.patients.check_picture import as_table, draw_check, summary_rows

@@ -76,7 +76,8 @@ def _identifiers(
     """The paths, as they are and as they were given, and what the files name; each with where it stands."""
     given = [str(path.resolve()) for path in paths] + [str(path) for path in paths if len(path.parts) > 1]
     found = dict.fromkeys(given, "the path of CT or labels")
-    for source in (volume, *segmentations):
+    sources: list[LazyVolume | Segmentation] = [volume, *segmentations]
+    for source in sources:
         found |= source.identifiers
     return found
 
