@@ -21,6 +21,9 @@ LEAST_LETTERS, LEAST_DIGITS = 3, 6
 # Texts of this length do not occur in voxels or triangles by chance.
 SURE_BYTES = 7
 ENCODINGS = ("utf-8", "utf-16-le", "latin-1")
+# Labels name the UIDs of a thousand slices: those are searched for in the digits of a file alone.
+UID = re.compile(r"[0-9.]+")
+NUMBERS = re.compile(rb"(?:[0-9.]\0?){4,}")
 GZIP = 31  # zlib's wbits for gzip
 COMMON = "left right kidney cyst vessels collecting system STL LPS ITK NRRD complete type int short unsigned char gzip space"
 
@@ -72,7 +75,8 @@ def _search(folder: Path, identifiers: Collection[str]) -> int:
     wanted = [text for text in identifiers if is_identifying(text)]
     for file in sorted(folder.iterdir()):
         words, everything = _contents(file)
-        if any(_holds(words, everything, text) for text in wanted):
+        numbers = b"\n".join(NUMBERS.findall(everything))
+        if any(_holds(words, numbers if UID.fullmatch(text) else everything, text) for text in wanted):
             raise PatientError(
                 f"{file.name} would have contained an identifier of the patient; nothing was written; this is a "
                 "fault of the program: please report it"

@@ -11,6 +11,8 @@ from scenes.patients.readers.dicom_files import SourceFile
 NAMING = ("PN", "DA", "DT", "UI")
 FREE_TEXT = ("LO", "SH", "ST", "LT", "UT", "UC", "UN", "AE")
 STANDARD_UID = "1.2.840.10008."
+# Coordinates, which identify nobody, and of which a structure set has a million.
+CONTOUR_DATA = 0x30060050
 # Public elements of free text that may identify a person; the others describe the scanner.
 PERSONAL_KEYWORDS = (
     "Patient", "Physician", "Operator", "Institution", "Accession", "StudyID", "StudyDescription", "SeriesDescription",
@@ -25,7 +27,7 @@ def identifiers_of(item: SourceFile) -> frozenset[str]:
 
 
 def _texts(data: Dataset) -> Iterator[str]:
-    for tag in sorted(data.keys()):
+    for tag in sorted(data.keys() - {CONTOUR_DATA}):
         try:
             element = data[tag]
             nested = list(element.value) if element.VR == "SQ" else []
