@@ -40,6 +40,10 @@ COMMANDS = {
         "scenes.patients.import_command:import_patient_command",
         "Make a patient's folder from a CT and its LABELS.",
     ),
+    "acknowledge": (
+        "scenes.acknowledge_command:acknowledge_command",
+        "Mark the warnings of PATIENT's import as checked.",
+    ),
     "plan": (
         "rehearsal.commands.plan_command:plan",
         "Plan a sweep over SCENE that covers the target, or a resection.",

@@ -24,6 +24,7 @@ from rehearsal.tracking.pose_file import TimedPoses
 from rehearsal.tracking.track_file import check_near, load_track
 from render.keys import Keys, load_keys
 from scenes.anatomy import LoadedAnatomy, fingerprint
+from scenes.import_findings import open_warnings
 from scenes.scene import Scene, load_scene, scene_file, with_options
 from ultrasound.probe import Probe, ProbeError, probe_of_values
 
@@ -41,6 +42,8 @@ class AskedFiles:
     resection_plan: ResectionPlan | None = None
     log: Log | None = None
     bands: UncertaintyBands | None = None
+    warnings: tuple[str, ...] = ()
+    """Of the patient's import, which nobody has acknowledged."""
 
 
 def read_files(asked: RehearseOptions) -> AskedFiles:
@@ -58,7 +61,8 @@ def read_files(asked: RehearseOptions) -> AskedFiles:
     log = session_of(asked.replay, asked.at) if asked.replay else None
     changed, probe = as_asked(scene, asked) if log is None else as_recorded(log, scene)
     bands = None if scene.uncertainty is None else read_bands(path.parent / scene.uncertainty)
-    return AskedFiles(path.parent, changed, probe, keys, track, plan, resection_plan, log, bands)
+    warnings = open_warnings(scene, path.parent)
+    return AskedFiles(path.parent, changed, probe, keys, track, plan, resection_plan, log, bands, warnings)
 
 
 def check_anatomy(files: AskedFiles, asked: RehearseOptions, anatomy: LoadedAnatomy) -> None:

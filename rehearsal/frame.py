@@ -35,6 +35,7 @@ from rehearsal.tracking.sweep_recording import SweepRecorder
 from render.keys import Keys
 from render.viewer import Controls, ScannerSettings, Settings, View
 from render.window import Window
+from scenes.import_findings import acknowledge
 from ultrasound.doppler import scale_colours
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane
@@ -51,6 +52,7 @@ MOST_TIMES = 100
 # A frame that took longer moves the transducer as if it had taken this long.
 MOST_ELAPSED_S = 0.25
 Source = TypeVar("Source", bound=InputSource)
+HOW_TO_ACKNOWLEDGE = "{acknowledge}: I have checked this in check.png"
 HOW_TO_PRESS = "{press} or {push} presses"
 
 
@@ -64,6 +66,8 @@ class Frames(Generic[Source]):
     tally: Tally
     link: OpenIGTLinkServer | None = None
     resection_plan: ResectionPlan | None = None
+    warnings: tuple[str, ...] = ()
+    """Of the import, which nobody has acknowledged."""
     resection: ResectionView = field(init=False)
 
     def __post_init__(self) -> None:
@@ -89,7 +93,7 @@ class Frames(Generic[Source]):
         """Compute the images of the probe at its present pose."""
         time_s = self.source.session.time_s
         view = image_view(self.rehearsal, probe, settings, self.tally, None, time_s)
-        return self.with_resection(view, settings)
+        return replace(self.with_resection(view, settings), warnings=self.warnings)
 
     def with_resection(self, view: View, settings: Settings) -> View:
         """A view with the score and the coming cut."""
@@ -130,6 +134,8 @@ class WindowFrames(Frames[WindowInput]):
     sweeping: SweepRecorder
     plans: PlanControl
     keys: Keys = field(default_factory=Keys)
+    folder: Path = Path()
+    """Of the scene: the patient's, where one was imported."""
     cine: Cine = field(default_factory=Cine)
     caliper: Caliper = field(default_factory=Caliper)
     times: FrameTimes = field(default_factory=FrameTimes)
@@ -229,6 +235,8 @@ class WindowFrames(Frames[WindowInput]):
         if controls.reset:
             self.caliper.points = ()
         self.notices.post(controls.message)
+        if controls.acknowledge and self.warnings:
+            self._save(self._acknowledge)
         self.plans.watch(controls)
         now, before = perf_counter(), self._input_at_s
         self._input_at_s = now
@@ -292,11 +300,17 @@ class WindowFrames(Frames[WindowInput]):
             caliper_mm=self.caliper.points,
             caliper=self.caliper.figure(shown),
             readouts=view.readouts | self._speeds(),
+            warnings=tuple(map(self.keys.worded, self._warnings())),
             clock=f"{self.source.session.time_s:.1f} s",
             pace=self._pace(),
             status=self._status(view, controls.settings),
             notes={name: self._with_hint(note) for name, note in view.notes.items()},
         )
+
+    def _warnings(self) -> tuple[str, ...]:
+        """The warnings of the import, and the key that acknowledges them."""
+        first = tuple(f"Import: {text}" for text in self.warnings)
+        return (*first, HOW_TO_ACKNOWLEDGE) if first else ()
 
     def _record_sweep(self, probe: Probe, view: View, controls: Controls) -> None:
         if not self.frozen:
@@ -364,6 +378,12 @@ class WindowFrames(Frames[WindowInput]):
             write()
         except OSError as error:
             self.notices.post(f"Not saved: {error.strerror}", in_terminal=False)
+
+    def _acknowledge(self) -> None:
+        """Mark the warnings of the import as checked. Raises OSError."""
+        acknowledge(self.folder)
+        self.warnings = ()
+        self.notices.post("warnings of the import acknowledged")
 
     def _export(self, settings: Settings, view: View) -> None:
         """Save images and surfaces; say what is missing, and why. Raises OSError."""

@@ -21,6 +21,7 @@ from render.display import window_size
 from render.gamepad import Gamepad, SdlPads
 from render.keys import Keys
 from scenes.anatomy import LoadedAnatomy, load_anatomy
+from scenes.import_findings import warning_lines
 from scenes.scene import Scene
 from scenes.terminal import ReportProgress, stages
 from ultrasound.probe import Probe
@@ -39,6 +40,8 @@ def opened(asked: RehearseOptions, process: StartedProcess | None) -> Iterator["
     start = StartTimes()
     start.begin("Files")
     files = read_files(asked)
+    for warning in warning_lines(files.warnings, files.folder):
+        click.echo(warning)
     with ExitStack() as resources:
         start.begin("Taichi")
         solver = None if process is None else resources.enter_context(solver_process(process))

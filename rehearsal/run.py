@@ -40,6 +40,7 @@ from rehearsal.tracking.tracked_probe import PoseSource, played_pose
 from render.viewer import Settings
 from render.window import Window
 from scenes.anatomy import LoadedAnatomy
+from scenes.import_findings import open_warnings
 from scenes.scene import EMBEDDED
 from scenes.terminal import shell_command
 from scenes.tumour_complexity import complexity
@@ -96,6 +97,8 @@ class RehearsalRun:
             plans=PlanControl(self.rehearsal, self.anatomy, self.measurements, self.asked.out, self.notices),
             keys=self.files.keys,
             resection_plan=self.files.resection_plan,
+            warnings=self.files.warnings,
+            folder=self.files.folder,
         )
         prepare(frames)
         try:
@@ -124,6 +127,7 @@ class RehearsalRun:
             Tally(self.build_s),
             self.link,
             self.files.resection_plan,
+            self.files.warnings,
         )
         with self._summarised(source, replay):
             run_headless(
@@ -138,9 +142,12 @@ class RehearsalRun:
             )
 
     def _about_patient(self) -> dict[str, Any]:
-        """The complexity of the tumour, for the report."""
+        """The complexity of the tumour and the warnings of the import, for the report."""
         found = complexity(self.anatomy, self.rehearsal.scene.attachment.at_mm)
-        return dict(complexity=None if found is None else found.figures())
+        return dict(
+            complexity=None if found is None else found.figures(),
+            import_warnings=list(self.files.warnings),
+        )
 
     def _replayed_steps(self, replay: Replay) -> int:
         steps = len(replay.log.poses) - replay.session.step_index
@@ -232,7 +239,8 @@ class RehearsalRun:
         # Matplotlib takes half a second to import.
         from rehearsal.resection.resection_page import report_of
 
-        return report_of(self.rehearsal, self.files.resection_plan)
+        warnings = list(open_warnings(self.files.scene, self.files.folder))
+        return report_of(self.rehearsal, self.files.resection_plan) | dict(import_warnings=warnings)
 
     def _end(self, bookmarks: int) -> None:
         summary, report = self.measurements.summary(bookmarks), self._resection()

@@ -33,6 +33,7 @@ from render.ultrasound_panel import (
     to_plane,
 )
 from render.viewer import View
+from render.warning_box import warning_image, warning_rect
 from render.window_layout import CLOCK_WIDTH, FIGURE_HEIGHT, FIGURES_PAD, Rect, WindowLayout
 
 READOUT_PERIOD_S = 0.4
@@ -89,7 +90,15 @@ class BackgroundImage:
         findings = first_of(view.findings, self.layout.most_findings)
         # What the backdrop depends on.
         plane = view.width_mm, view.depth_mm, view.above_mm, view.focus_mm, view.outline_mm is not None
-        parts = *plane, tuple(view.images), view.captions, view.scale, view.title, len(findings)
+        parts = (
+            *plane,
+            tuple(view.images),
+            view.captions,
+            view.scale,
+            view.title,
+            len(findings),
+            view.warnings,
+        )
         if self._shows_help or self._backdrop != parts:
             self._rows[:, :, :3] = backdrop(self.layout, view, self.keys.of["help"])
             self._figures, self._axes, self._status, self._shows_help = None, None, None, False
@@ -106,17 +115,28 @@ class BackgroundImage:
         if self._axes is None or not np.array_equal(axes, self._axes):
             self._put(self.layout.compass, compass_image(self.layout, axes))
             self._axes = axes
+        if (warned := warning_rect(self.layout, view.warnings)) is not None:
+            self._put(warned, warning_image(self.layout, view.warnings))
 
     def draw_scene(self, draw: Callable[[np.ndarray], None]) -> None:
         """Draw the 3D view into ``pixels``, behind what ``compose`` has drawn; ``draw`` does it."""
-        findings = self._figures[1] if self._figures is not None else {}
-        boxes = [self.layout.compass, *([self.layout.findings(len(findings))] if findings else [])]
+        boxes = [] if self._view is None else self.boxes_over_scene(self._view)
         over = [self._rows[box.slices].copy() for box in boxes]
         self._scene[:] = self._empty_scene
         draw(self.pixels)
         for box, image in zip(boxes, over, strict=True):
             self._rows[box.slices] = image
         self.has_scene = True
+
+    def boxes_over_scene(self, view: View) -> list[Rect]:
+        """The boxes that cover the 3D view: compass, findings, warnings."""
+        count = min(len(view.findings), self.layout.most_findings)
+        findings = self.layout.findings(count) if count else None
+        return [
+            box
+            for box in (self.layout.compass, findings, warning_rect(self.layout, view.warnings))
+            if box is not None
+        ]
 
     @property
     def _scene(self) -> np.ndarray:

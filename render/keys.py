@@ -72,6 +72,7 @@ KEY_MAP = {
         "set a bookmark; return to bookmarks": {"bookmark": "M", "to_bookmark": "J"},
         "start and stop recording a tracked sweep": {"sweep": "L"},
         "take control from a replay or a tracked probe": {"take_over": "K"},
+        "warnings of the import: checked": {"acknowledge": "Shift+I"},
         "reset tissue, transducer and view": {"reset": "R"},
         "save a screenshot of the window": {"screenshot": "P"},
         "show or hide this list": {"help": "H"},

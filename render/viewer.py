@@ -221,6 +221,8 @@ class View:
     """The session's time, in simulated seconds: "42.6 s"."""
     pace: str = ""
     """Its rate, where slower than real time: "0.2 x real"."""
+    warnings: tuple[str, ...] = ()
+    """Warnings that nobody has acknowledged, of the import."""
     title: str = ""
     """Scene or case; no identifiers of the patient."""
 
@@ -274,6 +276,8 @@ class Controls:
     """Set a mark of the score where this ray meets the organ: origin [mm] and unit direction, each (3,)."""
     cut_out: bool = False
     """Cut along the score."""
+    acknowledge: bool = False
+    """The warnings of the import were checked."""
     cine: int = 0
     """Frames to move forward (negative: back) in the cine memory."""
     export: bool = False

@@ -191,8 +191,9 @@ class Window:
         """Return the boxes of the background image that cover the 3D view."""
         if self._help_shown:
             return [self.layout.whole]
-        count = min(len(self._view.findings), self.layout.most_findings) if self._view is not None else 0
-        return [self.layout.compass, *([self.layout.findings(count)] if count else [])]
+        if self._view is None:
+            return [self.layout.compass]
+        return self._background.boxes_over_scene(self._view)
 
     def _pixel(self, cursor: np.ndarray) -> tuple[float, float]:
         """Return column and row at window coordinates."""

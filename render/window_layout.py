@@ -113,6 +113,12 @@ class WindowLayout:
         return Rect(gap, self.scene.bottom - gap - size, size, size)
 
     @property
+    def foot(self) -> Rect:
+        """The line at the foot of the 3D view, beside the compass, from which a box of warnings grows upwards."""
+        left, gap = self.compass.right + self.px(FINDINGS_GAP), self.px(FINDINGS_GAP)
+        return Rect(left, self.scene.bottom - gap, self.scene.right - gap - left, 0)
+
+    @property
     def most_findings(self) -> int:
         """How many lines of findings fit."""
         room = self.compass.top - 2 * self.px(FINDINGS_GAP) - self.scene.top - 2 * FIGURES_PAD

@@ -18,6 +18,7 @@ import app
 from rehearsal.planning.plan_file import Plan, PlannedSweep
 from rehearsal.sessions.session_file import End, Event, Header, Second
 from rehearsal.tracking.pose_file import load_poses, load_timed_poses
+from scenes.import_findings import GridFindings, ImportFindings, ImportWarning, SurfaceFindings
 from scenes.scene import Image, Scene, Trocar
 from scenes.tissue import NeoHookeanTissue, ShapeMatchingTissue
 from ultrasound.probe import Probe
@@ -291,6 +292,7 @@ def section(heading: str) -> set[str]:
         ("Scene", [NeoHookeanTissue, ShapeMatchingTissue, Trocar]),
         ("Session", [Header, Event, Second, End]),
         ("Plan", [Plan, PlannedSweep]),
+        ("Findings of an import", [ImportFindings, ImportWarning, GridFindings, SurfaceFindings]),
     ],
 )
 def test_data_formats_list_every_key(heading, models):

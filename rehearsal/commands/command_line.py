@@ -16,6 +16,7 @@ from pydantic.fields import FieldInfo
 from rehearsal.configuration import with_quality
 from rehearsal.result_files import write_json
 from scenes.atomic_files import check_writable
+from scenes.import_findings import open_warnings, warning_lines
 from scenes.scene import OPTIONS, Scene, load_scene, scene_file, with_options
 from scenes.tissue import QUALITIES
 from ultrasound.probe import DetailLevel, Mode
@@ -117,12 +118,22 @@ def save_figures(figures: dict[str, Any], json_file: Path) -> None:
 def load_patient(
     scene: Path, changes: Mapping[str, Any] = MappingProxyType({}), quality: str | None = None
 ) -> tuple[Scene, "LoadedAnatomy"]:
-    """Load a scene file or a patient's folder, changed by options, and its anatomy. Raises SceneError, PatientError."""
+    """Load a scene file or a patient's folder, changed by options, and its anatomy; print the warnings of its import.
+
+    Raises SceneError, PatientError.
+    """
     from scenes.anatomy import load_anatomy
 
     path = scene_file(scene)
     loaded = with_quality(with_options(load_scene(path), changes), quality)
+    echo_import_warnings(loaded, path.parent)
     return loaded, load_anatomy(loaded, path.parent)
+
+
+def echo_import_warnings(scene: Scene, folder: Path) -> None:
+    """Print the warnings of a patient's import that nobody has acknowledged. Raises SceneError."""
+    for line in warning_lines(open_warnings(scene, folder), folder):
+        click.echo(line)
 
 
 def numbers(text: str, option: str, least: float, most: float) -> list[float]:

@@ -6,7 +6,7 @@ from typing import Annotated
 import click
 import trimesh
 
-from rehearsal.commands.command_line import ARGUMENT, CommandOptions, command
+from rehearsal.commands.command_line import ARGUMENT, CommandOptions, command, echo_import_warnings
 from rehearsal.result_files import counted
 from scenes.anatomy import LoadedAnatomy, files_of, load_anatomy
 from scenes.atomic_files import check_folder, new_folder
@@ -36,6 +36,7 @@ def export(asked: ExportOptions) -> None:
     path, out, suffix = scene_file(asked.scene), asked.out, asked.suffix
     check_folder(out)
     loaded = load_scene(path)
+    echo_import_warnings(loaded, path.parent)
     anatomy = load_anatomy(loaded, path.parent)
     named = surfaces(anatomy)
     with new_folder(out) as partial:

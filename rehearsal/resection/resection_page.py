@@ -17,7 +17,7 @@ from rehearsal.resection.cut import Cut
 from rehearsal.resection.judgement import MARGIN_LIMITS_MM, Judgement
 from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.score_line import ResectionError
-from rehearsal.result_files import save_figure, write_json
+from rehearsal.result_files import counted, save_figure, write_json
 from scenes.surfaces import signed_distance_from
 
 NAME = "resection"
@@ -153,7 +153,7 @@ def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
     shown = ", ".join(vessels[:3]) + (f" and {len(vessels) - 3} more" if len(vessels) > 3 else "")
     below = ", ".join(f"{report[f'margin_below_{limit:g}_mm2']:.0f}" for limit in MARGIN_LIMITS_MM)
     limits = ", ".join(f"{limit:g}" for limit in MARGIN_LIMITS_MM)
-    plan = report.get("against_plan")
+    plan, warnings = report.get("against_plan"), len(report.get("import_warnings", []))
     against = (
         []
         if plan is None
@@ -189,4 +189,5 @@ def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
         ("vessels cut", shown or "none"),
         ("bed", f"{report['bed_mm2'] / 100:.1f} cm2"),
         *against,
+        *([("import", f"{counted(warnings, 'warning')} not acknowledged")] if warnings else []),
     ]

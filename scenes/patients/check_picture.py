@@ -14,6 +14,8 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from scipy.spatial.distance import pdist
+from skimage.color import rgb2lab
 
 from scenes.patients.organ_selection import HILAR
 from scenes.patients.part_surfaces import PARTS, PEDICLE_MM
@@ -37,6 +39,10 @@ COLOUR = {
 }
 WORD = {"organ": "kidney", "urine": "collecting system", "vessel": "vessels"}
 LEAST_BRIGHT = 0.85
+# Of two colours, in CIELAB: well above what side by side lines need.
+LEAST_DIFFERENCE = 20.0
+# Lengths of the scale bar, and its largest share of the image's width: the letter is in the middle.
+BARS_MM, BAR_SHARE = (50.0, 20.0), 0.35
 # Letters in a line of the largest text, its sizes [points], and lines times size that fit above the names of the colours.
 TEXT_WIDTH = 56
 TEXT_POINTS = (8.5, 8.0, 7.5, 7.0, 6.5, 6.0, 5.5, 5.0)
@@ -49,6 +55,7 @@ LETTER: dict[str, Any] = dict(
     va="center",
     path_effects=[withStroke(linewidth=3, foreground="black")],
 )
+BAR: dict[str, Any] = dict(color="white", path_effects=[withStroke(linewidth=5, foreground="black")])
 LIGHT = np.array([-0.4, -0.8, 0.45])  # from the front, the patient's right and above
 # View azimuth [degrees], and the signs of the light's direction.
 AZIMUTH = {"from the front": (-105, np.ones(3)), "from behind": (75, np.array([-1.0, -1.0, 1.0]))}
@@ -79,7 +86,7 @@ def summary_rows(patient: Patient) -> list[tuple[str, str]]:
     """The summary for the terminal and the check image: a title and a line each, without names, dates or paths."""
     volumes = patient.volumes_ml
     size = " x ".join(str(n) for n in patient.ct.GetSize())
-    spacing = " x ".join(f"{s:.2f}" for s in patient.spacing_mm)
+    spacing = " x ".join(f"{s:.2f}" for s in patient.source.spacing)
     extent = " x ".join(f"{e:.0f}" for e in patient.organ.extents)
     surface_ml = patient.organ.volume / 1000
     rows = [("DRAFT", DRAFT)] if patient.draft else []
@@ -138,13 +145,20 @@ def draw_check(patient: Patient, rows: list[tuple[str, str]], folder: Path) -> N
 
 
 def colours_of(patient: Patient) -> dict[str, Colour]:
-    """Colours of organ, parts and support: those of the label files, brightened for the dark background."""
-    own = {name: _bright(colour) for name, colour in patient.colours.items()}
-    return {name: to_rgb(colour) for name, colour in COLOUR.items()} | own
+    """Colours of organ, parts and support: those of the label files, brightened for the dark background.
+
+    Where two of these look alike, none of them is used.
+    """
+    usual = {name: to_rgb(colour) for name, colour in COLOUR.items()}
+    own = usual | {name: _bright(colour) for name, colour in patient.colours.items()}
+    shown = rgb2lab([[own[name] for name in ("organ", *patient.parts, "support")]])[0]
+    return own if pdist(shown).min() >= LEAST_DIFFERENCE else usual
 
 
 def _bright(colour: Colour) -> Colour:
-    scale = max(1.0, LEAST_BRIGHT / max(*colour, 1e-3))
+    if max(colour) < 1e-3:
+        return LEAST_BRIGHT, LEAST_BRIGHT, LEAST_BRIGHT
+    scale = max(1.0, LEAST_BRIGHT / max(colour))
     return colour[0] * scale, colour[1] * scale, colour[2] * scale
 
 
@@ -171,8 +185,19 @@ def _draw_slice(
             axes.plot(line @ right, line @ down, color=colours[name], linewidth=1.4)
     axes.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[])
     axes.set_title(view.name, color="white", fontsize=11)
+    _draw_scale_bar(axes, extent)
     for letter, place in zip(view.letters, ((0.03, 0.5), (0.97, 0.5), (0.5, 0.97), (0.5, 0.03)), strict=True):
         axes.text(*place, letter, transform=axes.transAxes, fontsize=17, **LETTER)
+
+
+def _draw_scale_bar(axes: Axes, extent: tuple[float, float, float, float]) -> None:
+    """Draw a line of one of BARS_MM at the lower right."""
+    left, right, bottom, top = extent
+    length = next((mm for mm in BARS_MM if mm <= BAR_SHARE * (right - left)), BARS_MM[-1])
+    end, height = right - 0.05 * (right - left), bottom - 0.05 * (bottom - top)
+    axes.plot([end - length, end], [height, height], solid_capstyle="butt", linewidth=3, **BAR)
+    label = dict(LETTER, va="bottom")
+    axes.text(end - length / 2, height - 0.015 * (bottom - top), f"{length:g} mm", fontsize=9, **label)
 
 
 def resample_plane(

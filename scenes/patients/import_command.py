@@ -7,7 +7,8 @@ import numpy as np
 
 from errors import PatientError
 from scenes.atomic_files import check_folder
-from scenes.patients.patient_folder import save_patient
+from scenes.import_findings import FINDINGS_FILE, findings_text
+from scenes.patients.patient_folder import save_patient, without_identifiers
 from scenes.patients.readers.segment_names import Side
 from scenes.scene import scene_text
 from scenes.terminal import bar, shell_command
@@ -27,9 +28,8 @@ LABEL = "Names or values of the labels"
 @click.command("import")
 @click.argument("ct", type=click.Path(path_type=Path))
 @click.argument("labels", type=click.Path(path_type=Path), nargs=-1)
-@click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="Folder to write to; new or empty."
-)
+@click.option("--out", type=click.Path(path_type=Path), help="Folder to write to; new or empty.")
+@click.option("--list", "lists", is_flag=True, help="List series and labels, and make nothing.")
 @click.option(
     "--organ", help=f"{LABEL} that are the organ, such as 1,2 [named as a kidney; without names, all]."
 )
@@ -54,7 +54,8 @@ LABEL = "Names or values of the labels"
 def import_patient_command(
     ct: Path,
     labels: tuple[Path, ...],
-    out: Path,
+    out: Path | None,
+    lists: bool,
     organ: str | None,
     side: Side | None,
     series: str | None,
@@ -69,18 +70,30 @@ def import_patient_command(
     CT: a folder with DICOM, a DICOMDIR or zip archive, a NIfTI, NRRD or MHA file. LABELS: label maps, a folder with one
     file per organ, DICOM-SEG, RTSTRUCT; by default the segmentation in the CT's folder.
     """
+    if lists:
+        from scenes.patients.import_listing import listing_text
+
+        click.echo(listing_text(ct, labels, bar))
+        return
+    if out is None:
+        raise click.UsageError("--out: expected a folder to write to, or --list to see what there is")
     check_folder(out)
     # Matplotlib and highdicom take 0.5 s to import.
     from scenes.patients.check_picture import as_table, draw_check, summary_rows
     from scenes.patients.import_request import import_request
+    from scenes.patients.patient_findings import findings_of
     from scenes.patients.patient_scene import patient_scene
 
     tissues = {TISSUE_OPTIONS[o]: label_words(text, o) for o, text in words.items() if text is not None}
     own = [] if organ is None else label_words(organ, "organ")
     position = None if seed is None else position_mm(seed)
     patient, identifiers = import_request(ct, labels, own, tissues, side, series, position, support, bar)
+    patient = without_identifiers(patient, identifiers)
     rows = summary_rows(patient)
-    texts = {"scene.toml": scene_text(patient_scene(patient))}
+    texts = {
+        "scene.toml": scene_text(patient_scene(patient)),
+        FINDINGS_FILE: findings_text(findings_of(patient)),
+    }
     searched = save_patient(
         patient, out, texts, lambda folder: draw_check(patient, rows, folder), identifiers
     )

@@ -12,7 +12,7 @@ from scenes.patients.patient_import import Patient, import_patient
 from scenes.patients.readers.ct_series import ct_candidates, open_ct, read_dicom_headers
 from scenes.patients.readers.dicom_headers import DicomContents
 from scenes.patients.readers.label_files import Segmentation, open_labels, segmentation_of
-from scenes.patients.readers.label_maps import assign_tissues, merge_label_maps
+from scenes.patients.readers.label_maps import absent_labels, assign_tissues, merge_label_maps
 from scenes.patients.readers.segment_names import Side
 from scenes.patients.readers.series_choice import choose_series
 from scenes.patients.region_growing import draft_segmentation
@@ -32,8 +32,8 @@ def import_request(
     seed_mm: np.ndarray | None = None,
     support: str = "mould",
     progress: Progress = silent,
-) -> tuple[Patient, set[str]]:
-    """The imported patient, and the identifiers that none of its files may contain.
+) -> tuple[Patient, dict[str, str]]:
+    """The imported patient, and the identifiers that none of its files may contain, with where each stands.
 
     Args:
         ct, labels: paths of the user.
@@ -51,13 +51,16 @@ def import_request(
         raise PatientError(f"{ct}: no such file or folder; check the path")
     tissues = tissues or {}
     segmentations: list[Segmentation] = []
+    absent: tuple[str, ...] = ()
     if seed_mm is None:
-        found = None if is_volume_file(ct) else read_dicom_headers(ct, progress)
+        contents = None if ct.is_file() and is_volume_file(ct) else read_dicom_headers(ct, progress)
         words = [*organ, *chain(*tissues.values())]
-        segmentations = _segmentations(ct, found, labels, series, words, progress)
-        volume = volume_of_labels(ct, segmentations, series, progress, found)
+        segmentations = _segmentations(ct, contents, labels, series, words, progress)
+        volume = volume_of_labels(ct, segmentations, series, progress, contents)
         maps = [one for segmentation in segmentations for one in segmentation.maps(volume.grid)]
-        merged = merge_label_maps(assign_tissues(maps, organ, tissues))
+        empty = [segment for segmentation in segmentations for segment in segmentation.empty]
+        merged = merge_label_maps(assign_tissues(maps, organ, tissues, empty))
+        absent = absent_labels(maps, tissues)
     elif labels or organ or tissues:
         raise PatientError(
             "--seed segments the organ where there are no labels: give it, or labels, not both"
@@ -66,16 +69,22 @@ def import_request(
         volume = open_ct(ct, series, progress=progress)
         merged = draft_segmentation(volume, seed_mm)
     own = merged.values_of(organ) if organ else None
-    patient = import_patient(
-        volume, merged, own, side, support=support, needed=set(tissues), progress=progress
-    )
+    patient = import_patient(volume, merged, own, side, support=support, given=tissues, progress=progress)
     notes = [note for segmentation in segmentations for note in segmentation.notes]
-    paths = {str(path.resolve()) for path in (ct, *labels)}
-    paths |= {str(path) for path in (ct, *labels) if len(path.parts) > 1}
-    identifiers = paths.union(
-        volume.identifiers, *(segmentation.identifiers for segmentation in segmentations)
-    )
-    return replace(patient, notes=(*patient.notes, *notes), draft=seed_mm is not None), identifiers
+    found = replace(patient, notes=(*patient.notes, *notes, *absent), draft=seed_mm is not None)
+    return found, _identifiers((ct, *labels), volume, segmentations)
+
+
+def _identifiers(
+    paths: Sequence[Path], volume: LazyVolume, segmentations: list[Segmentation]
+) -> dict[str, str]:
+    """The paths, as they are and as they were given, and what the files name; each with where it stands."""
+    given = [str(path.resolve()) for path in paths] + [str(path) for path in paths if len(path.parts) > 1]
+    found = dict.fromkeys(given, "the path of CT or labels")
+    sources: list[LazyVolume | Segmentation] = [volume, *segmentations]
+    for source in sources:
+        found |= source.identifiers
+    return found
 
 
 def _segmentations(

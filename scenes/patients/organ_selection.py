@@ -91,7 +91,13 @@ def _with_touching(parts: np.ndarray, n: int, of_organ: list[int]) -> np.ndarray
 
 def _organ_values(labels: LabelMap, organ: Sequence[int] | None) -> list[int]:
     if organ is not None:
-        return list(organ)
+        # Tumours and cysts are lesions wherever they are given: apart from every kidney they are no organ.
+        own = [value for value in organ if labels.segments[value].tissue not in LESIONS]
+        if not own:
+            raise PatientError(
+                "the organ's labels are only those of tumours and cysts; give the kidney's own with --organ, too"
+            )
+        return own
     named = any(segment.name or segment.tissue for segment in labels.segments.values())
     own = labels.of_tissues(*PARENCHYMA)
     if not own and all(not s.name for s in labels.segments.values()):

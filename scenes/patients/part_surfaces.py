@@ -46,10 +46,8 @@ def organ_surface(piece: Organ) -> trimesh.Trimesh:
     return _surface(piece.grid.image(piece.mask.astype(np.uint8)), "organ", FACES)
 
 
-def part_masks(labels: LabelMap, piece: Organ, needed: Collection[str]) -> PartMasks:
-    """Masks of the parts in the organ, and of vessels and collecting system near it. Raises PatientError where a needed one is
-    missing.
-    """
+def part_masks(labels: LabelMap, piece: Organ) -> PartMasks:
+    """Masks of the parts in the organ, and of vessels and collecting system near it."""
     found = {}
     for tissue in PARTS:
         values = labels.of_tissues(*(VESSELS if tissue == "vessel" else (tissue,)))
@@ -60,12 +58,28 @@ def part_masks(labels: LabelMap, piece: Organ, needed: Collection[str]) -> PartM
             grid, inside = near_organ(labels, piece, values)
         if inside.any():
             found[tissue] = grid, inside
-        elif tissue in needed:
-            raise PatientError(
-                f"the {tissue} does not touch {piece.title}: expected one of this kidney; choose the other side, or leave out "
-                f"which label is its {tissue}"
-            )
     return found
+
+
+def parts_elsewhere(
+    labels: LabelMap, piece: Organ, pieces: Sequence[Organ], found: PartMasks, given: Collection[str]
+) -> tuple[list[str], list[str]]:
+    """Notes and warnings of the given tissues whose labels are not in ``found``, the parts of one of the organs."""
+    notes, warnings = [], []
+    for tissue in given:
+        values = labels.of_tissues(tissue)
+        part = "vessel" if tissue in VESSELS else tissue
+        if not values or part not in PARTS or part in found:
+            continue
+        if tissue in HILAR:
+            notes.append(f"the {tissue}'s label is more than {PEDICLE_MM:g} mm from this kidney")
+        elif any(np.isin(other.values[other.mask], values).any() for other in pieces if other is not piece):
+            notes.append(f"the {tissue}'s label is only in the other kidney")
+        else:
+            warnings.append(
+                f"the {tissue}'s label touches no labelled kidney, and was left out; compare the labels with the CT"
+            )
+    return notes, warnings
 
 
 @contextmanager

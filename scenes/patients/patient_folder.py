@@ -2,9 +2,11 @@
 
 import re
 import zlib
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 
 import SimpleITK as sitk
 
@@ -12,12 +14,15 @@ from errors import PatientError
 from scenes.atomic_files import new_folder
 from scenes.patients.part_surfaces import PARTS
 from scenes.patients.patient_import import Patient
+from scenes.patients.readers.label_maps import MERGE_ORDER
 from scenes.scene import AnatomyFiles, Scene, scene_text
 from scenes.surfaces import STL_HEADER_BYTES, save_surface
 from scenes.volumes.volume_files import save_image
 
 # Shorter texts, such as the ID 7, and numbers under six digits identify nobody.
 LEAST_LETTERS, LEAST_DIGITS = 3, 6
+MEASURE = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)")
+REDACTED = "[removed]"
 # Texts of this length do not occur in voxels or triangles by chance.
 SURE_BYTES = 7
 ENCODINGS = ("utf-8", "utf-16-le", "latin-1")
@@ -25,7 +30,7 @@ ENCODINGS = ("utf-8", "utf-16-le", "latin-1")
 UID = re.compile(r"[0-9.]+")
 NUMBERS = re.compile(rb"(?:[0-9.]\0?){4,}")
 GZIP = 31  # zlib's wbits for gzip
-COMMON = "left right kidney cyst vessels collecting system STL LPS ITK NRRD complete type int short unsigned char gzip space"
+COMMON = "left right kidney cyst vessels collecting system STL LPS ITK NRRD complete type int short unsigned char gzip space mm ml HU CT"
 
 
 def save_patient(
@@ -33,7 +38,7 @@ def save_patient(
     folder: Path,
     texts: dict[str, str] | None = None,
     draw: Callable[[Path], None] | None = None,
-    identifiers: Collection[str] = (),
+    identifiers: Mapping[str, str] = MappingProxyType({}),
 ) -> int:
     """Write ct.nrrd, labels.nrrd, organ.stl, support.stl and a surface for each part: all or nothing.
 
@@ -42,7 +47,7 @@ def save_patient(
         folder: new or empty.
         texts: further text files (the scene), name -> content.
         draw: writes further files into a folder (the check image).
-        identifiers: names, IDs, dates, paths that no file may contain.
+        identifiers: names, IDs, dates, paths that no file may contain, and where each stands in the source.
 
     Returns:
         The number of identifiers that were searched for and not found.
@@ -70,30 +75,69 @@ def _write(patient: Patient, folder: Path, texts: dict[str, str]) -> None:
         (folder / name).write_text(text, encoding="utf-8")
 
 
-def _search(folder: Path, identifiers: Collection[str]) -> int:
+def _search(folder: Path, identifiers: Mapping[str, str]) -> int:
     """Search all files of a folder, return the number of identifiers searched. Raises PatientError where one is found."""
-    wanted = [text for text in identifiers if is_identifying(text)]
+    wanted = {text: place for text, place in identifiers.items() if is_identifying(text)}
     for file in sorted(folder.iterdir()):
         words, everything = _contents(file)
         numbers = b"\n".join(NUMBERS.findall(everything))
-        if any(_holds(words, numbers if UID.fullmatch(text) else everything, text) for text in wanted):
-            raise PatientError(
-                f"{file.name} would have contained an identifier of the patient; nothing was written; this is a "
-                "fault of the program: please report it"
-            )
+        for text, place in wanted.items():
+            if _holds(words, numbers if UID.fullmatch(text) else everything, text):
+                raise PatientError(
+                    f"{file.name} would have contained the text of {place}; expected no text of the source, which may identify the "
+                    "patient; nothing was written; if that text identifies nobody, remove it from a copy of the source and import that; "
+                    "else report this as a fault of the program"
+                )
     return len(wanted)
 
 
+def without_identifiers(patient: Patient, identifiers: Collection[str]) -> Patient:
+    """The patient with notes and warnings that name nobody."""
+    return replace(
+        patient,
+        notes=tuple(redacted(note, identifiers) for note in patient.notes),
+        warnings=tuple(redacted(warning, identifiers) for warning in patient.warnings),
+    )
+
+
+def redacted(text: str, identifiers: Collection[str]) -> str:
+    """A text without the identifiers: in notes and warnings, which may quote names of files and labels."""
+    for identifier in filter(is_identifying, identifiers):
+        is_sure = len(identifier) >= SURE_BYTES and not identifier.isdigit()
+        pattern = re.escape(identifier) if is_sure else _as_word(re.escape(identifier))
+        text = re.sub(pattern, REDACTED, text, flags=re.IGNORECASE)
+    return text
+
+
+def _as_word(pattern: str) -> str:
+    """A pattern that matches whole words and numbers only; an underscore separates words."""
+    return rf"(?<![^\W_])(?<!\d\.){pattern}(?![^\W_])(?!\.\d)"
+
+
 def is_identifying(text: str) -> bool:
-    """Whether a text can identify somebody: long enough, and not only words that are in every patient's files."""
-    if len(text) < (LEAST_DIGITS if text.isdigit() else LEAST_LETTERS):
+    """Whether a text can identify somebody: long enough, no mere numbers, and not only words that are in every patient's files."""
+    if not any(letter.isalpha() for letter in text):
+        numbers = [part for part in re.split(r"[\\,;\s]+", text) if part]
+        is_long = sum(map(str.isdigit, text)) >= LEAST_DIGITS
+        return is_long and not all(map(_is_measure, numbers))
+    if len(text) < LEAST_LETTERS:
         return False
-    return not set(re.findall(r"\w+", text.lower())) <= _common_words()
+    words = re.findall(r"[^\W_]+", text.lower())
+    return any(
+        word not in _common_words() and not (word.isdigit() and len(word) < LEAST_DIGITS) for word in words
+    )
+
+
+def _is_measure(number: str) -> bool:
+    """Whether a number is a measured value or a count, not an ID or a date of LEAST_DIGITS digits or more."""
+    return bool(MEASURE.fullmatch(number)) and not (number.isdigit() and len(number) >= LEAST_DIGITS)
 
 
 @cache
 def _common_words() -> frozenset[str]:
-    written = scene_text(Scene(anatomy=AnatomyFiles(phantom=True))) + COMMON
+    written = (
+        scene_text(Scene(anatomy=AnatomyFiles(phantom=True))) + COMMON + " ".join(filter(None, MERGE_ORDER))
+    )
     return frozenset(re.findall(r"[^\W\d]+", written.lower().replace("_", " ")))
 
 
@@ -103,7 +147,7 @@ def _contents(file: Path) -> tuple[bytes, bytes]:
     if file.suffix == ".nrrd":
         header, _, packed = content.partition(b"\n\n")
         return header, header + zlib.decompress(packed, wbits=GZIP)
-    return (content if file.suffix == ".toml" else content[:STL_HEADER_BYTES]), content
+    return (content if file.suffix in (".toml", ".json") else content[:STL_HEADER_BYTES]), content
 
 
 def _holds(words: bytes, everything: bytes, text: str) -> bool:
@@ -113,6 +157,6 @@ def _holds(words: bytes, everything: bytes, text: str) -> bool:
         if len(wanted) >= SURE_BYTES and not text.isdigit():
             if wanted in everything:
                 return True
-        elif wanted and re.search(rb"(?<![\w.])" + re.escape(wanted) + rb"(?![\w.])", words):
+        elif wanted and re.search(_as_word(re.escape(text)), words.decode(encoding, "replace")):
             return True
     return False

@@ -29,6 +29,7 @@ from scenes.patients.part_surfaces import (
     organ_surface,
     part_masks,
     part_surfaces_in_processes,
+    parts_elsewhere,
 )
 from scenes.patients.readers.label_maps import Colour, LabelMap, present_values, resample_nearest
 from scenes.patients.readers.segment_names import Side
@@ -60,7 +61,8 @@ class Patient:
     side: Side
     volumes_ml: dict[str, float]  # of the labels: "organ" with all its parts, and each part
     overview: sitk.Image  # int16 [HU], the CT's full width at the organ's level, coarse; only for check.png
-    spacing_mm: tuple[float, float, float]  # of the CT's voxels along the image's own axes
+    source: VoxelGrid  # of the whole CT, before it was cropped
+    series: str = ""  # number of the CT's series
     notes: tuple[str, ...] = ()  # what was chosen, left out, resampled
     warnings: tuple[str, ...] = ()  # what looks wrong or was assumed
     colours: dict[str, Colour] = field(default_factory=dict)  # of organ and parts, where labels have one
@@ -78,7 +80,7 @@ def import_patient(
     side: Side | None = None,
     margin_mm: float = 60.0,
     support: str = "mould",
-    needed: Collection[str] = (),
+    given: Collection[str] = (),
     progress: Progress = silent,
 ) -> Patient:
     """Crop one organ from a CT and its label map, and make its surfaces and its support.
@@ -91,7 +93,7 @@ def import_patient(
             side.
         margin_mm: CT kept around the organ [mm].
         support: what the organ rests on: a "mould" of its underside, a bed of the surrounding "labels", or a surface file.
-        needed: tissues that must be in the organ, because the user named their labels.
+        given: tissues whose labels the user named: a note tells which of them this organ does not have.
         progress: shows the progress of the surfaces.
 
     Raises:
@@ -120,7 +122,8 @@ def import_patient(
         *stone_warnings(grid, hounsfield, of("kidney", "cortex", "medulla", "sinus"), of("urine")),
         *label_warnings(labels, piece, organ is not None),
     )
-    found = part_masks(labels, piece, needed)
+    found = part_masks(labels, piece)
+    part_notes, part_warnings = parts_elsewhere(labels, piece, pieces, found, given)
     with part_surfaces_in_processes(found) as parts_made:
         surface = organ_surface(piece)
         _check_surface(surface, piece)
@@ -137,9 +140,10 @@ def import_patient(
         side=actual_side,
         volumes_ml={"organ": piece.volume_ml, **{part: volumes[part] for part in parts}},
         overview=_overview(level, level_hu),
-        spacing_mm=tuple(grid.spacing.tolist()),
-        notes=ct.notes,
-        warnings=warnings,
+        source=ct.grid,
+        series=ct.series,
+        notes=(*ct.notes, *part_notes),
+        warnings=(*warnings, *part_warnings),
         colours=colours_of_labels(labels, [*parts]),
     )
 

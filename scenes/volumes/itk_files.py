@@ -41,10 +41,12 @@ def itk_volume(path: Path, vectors: bool = False) -> LazyVolume:
     if (components != 1 and not vectors) or "complex" in kind:
         raise no_scalar(path, kind)
     metadata = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys() if key.isprintable()}
-    own = {text for key, text in metadata.items() if not key.startswith(("NRRD_", "ITK_", "Segment"))}
-    return LazyVolume(
-        str(path), grid, partial(_itk_box, path), identifiers=frozenset(own - {""}), metadata=metadata
-    )
+    own = {
+        text: f"the header's field {key}"
+        for key, text in metadata.items()
+        if text and not key.startswith(("NRRD_", "ITK_", "Segment"))
+    }
+    return LazyVolume(str(path), grid, partial(_itk_box, path), identifiers=own, metadata=metadata)
 
 
 def _itk_box(path: Path, box: Box) -> np.ndarray:

@@ -33,10 +33,11 @@ class LazyVolume:
     read_box: Callable[[Box], np.ndarray]  # voxels (z, y, x) of a box
     notes: tuple[str, ...] = ()  # for the user: what was chosen, left out or resampled
     references: DicomReferences = NO_REFERENCES  # the DICOM objects that it consists of
-    identifiers: frozenset[str] = frozenset()  # of the patient (PHI); no written file may contain them
-    metadata: Mapping[str, str] = field(
-        default_factory=dict
-    )  # of a file's header, with the names of its labels
+    series: str = ""  # number of the DICOM series
+    # Of the patient (PHI), and where each stands; no written file may contain them.
+    identifiers: Mapping[str, str] = field(default_factory=dict)
+    # Of a file's header, with the names of its labels.
+    metadata: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, image: sitk.Image, name: str = "the image") -> LazyVolume:

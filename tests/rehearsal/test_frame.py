@@ -218,6 +218,33 @@ def test_a_restored_state_is_a_notice_and_stands_in_the_panel_for_a_while(loopin
     )
 
 
+def test_warnings_of_the_import_stay_until_they_are_acknowledged(looping, monkeypatch, capsys):
+    marked = []
+    monkeypatch.setattr(frame, "acknowledge", marked.append)
+    looping.warnings, looping.folder = ("12 % of the rim is fat",), looping.out / "patient"
+    for _ in range(2):
+        assert next_view(looping, Controls(Settings())).warnings == (
+            "Import: 12 % of the rim is fat",
+            "Shift+I: I have checked this in check.png",
+        )
+    assert marked == []
+    after = next_view(looping, Controls(Settings(), acknowledge=True))
+    assert after.warnings == () and marked == [looping.folder]
+    assert "acknowledged" in after.status and "acknowledged" in capsys.readouterr().out
+    next_view(looping, Controls(Settings(), acknowledge=True))
+    assert len(marked) == 1
+
+
+def test_warnings_that_cannot_be_acknowledged_stay(looping, monkeypatch):
+    def refuse(folder):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr(frame, "acknowledge", refuse)
+    looping.warnings = ("a warning",)
+    view = next_view(looping, Controls(Settings(), acknowledge=True))
+    assert len(view.warnings) == 2 and "Read-only" in view.status
+
+
 def test_a_sweep_that_is_recorded_stands_in_the_panel_beside_all_else(looping, monkeypatch):
     clock = [100.0]
     monkeypatch.setattr(frame, "perf_counter", lambda: clock[0])

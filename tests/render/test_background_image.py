@@ -20,6 +20,7 @@ from render.sliders import boxes_of, groups_of
 from render.text import fitting_size, font, shortened, write
 from render.ultrasound_panel import ALERT, CALIPER, OUTLINE, OUTLINE_AT_REST, QUIET, TEXT, to_plane
 from render.viewer import SCANNER_GROUPS, Geometry, Settings, View
+from render.warning_box import warning_lines, warning_rect
 from render.window_layout import Rect, WindowLayout
 
 LAYOUT = WindowLayout(1280, 720)
@@ -295,6 +296,40 @@ def test_findings_grow_with_their_lines_and_the_last_are_left_out(size):
     rows = np.flatnonzero((empty != full).any(axis=(1, 2)))
     assert rows.max() < layout.compass.top
     assert len(coloured(full, layout.findings(1), ALERT)) > 20
+
+
+LONG = "a warning of several lines, with figures and what to do " * 4
+
+
+@each_size
+def test_warnings_stand_at_the_foot_of_the_3d_view(size):
+    layout = WindowLayout(*size)
+    page = BackgroundImage(layout)
+    plain, warned = composed(page), composed(page, warnings=("short", LONG))
+    changed = np.argwhere((plain != warned).any(axis=2))
+    box = warning_rect(layout, ("short", LONG))
+    assert (
+        box is not None
+        and apart(box, layout.compass)
+        and box in page.boxes_over_scene(view(warnings=("short", LONG)))
+    )
+    low, high = changed.min(axis=0), changed.max(axis=0)
+    assert (low >= (box.top, box.left)).all() and (high < (box.bottom, box.right)).all()
+    assert box.right < layout.panel.left and box.bottom < layout.strip.top
+    assert len(coloured(warned, box, ALERT)) > 200
+    # No line is longer than the box.
+    inner = Rect(box.right - 4, box.top + 2, 3, box.height - 4)
+    assert len(coloured(warned, inner, ALERT)) == 0
+    # They leave nothing behind.
+    assert np.array_equal(composed(page), plain)
+
+
+@each_size
+def test_many_warnings_leave_most_of_the_3d_view_free(size):
+    layout = WindowLayout(*size)
+    box = warning_rect(layout, (LONG,) * 9)
+    assert box is not None and 0.2 < box.height / layout.scene.height < 0.5
+    assert warning_lines(layout, (LONG,) * 9)[-1] == "..." and warning_rect(layout, ()) is None
 
 
 def test_the_help_covers_all_and_leaves_nothing_behind():

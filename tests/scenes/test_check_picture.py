@@ -86,6 +86,41 @@ def test_files_own_colours_are_shown_brightly(patient):
     assert colours_of(own)["support"] == colours_of(patient)["support"]
 
 
+@pytest.mark.parametrize(
+    "colours",
+    [
+        {"organ": (0.9, 0.1, 0.1), "tumour": (0.9, 0.1, 0.1)},
+        {"organ": (0.0, 0.0, 0.0), "tumour": (0.02, 0.02, 0.02)},
+        {"organ": (0.5, 0.5, 0.0), "tumour": (0.5, 0.52, 0.0)},
+        # As the tumour is drawn where no file says its colour.
+        {"organ": (1.0, 0.88, 0.3)},
+    ],
+)
+def test_colours_that_look_alike_are_not_used(patient, colours):
+    assert colours_of(replace(patient, colours=colours)) == colours_of(patient)
+
+
+def test_every_section_has_a_scale_bar(patient, tmp_path):
+    """Its white pixels are as long as 20 mm of the image beside it."""
+    dark = replace(patient, ct=with_voxels(patient.ct, np.full(patient.ct.GetSize()[::-1], -1000, np.int16)))
+    draw_check(dark, summary_rows(patient), tmp_path)
+    picture = matplotlib.image.imread(tmp_path / "check.png")[..., :3]
+    low, high = VoxelGrid.of(patient.ct).bounds()
+    for n, view in enumerate(VIEWS):
+        panel = panel_of(picture, n)[0]
+        lengths = [longest_run(row > 0.97) for row in panel.min(axis=2)]
+        # The image is black from one side to the other.
+        width_px = max(longest_run(row < 0.03) for row in panel.max(axis=2))
+        width_mm = (high - low) @ np.abs(view.right)
+        assert max(lengths) == pytest.approx(20.0 / width_mm * width_px, abs=3.0), view.name
+
+
+def longest_run(row) -> int:
+    """Length of the longest run of true values."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(int)))
+    return int((ends[1::2] - ends[::2]).max(initial=0))
+
+
 def test_the_file_says_nothing_of_its_maker(patient, tmp_path):
     draw_check(patient, summary_rows(patient), tmp_path)
     content = (tmp_path / "check.png").read_bytes()

@@ -1,5 +1,7 @@
 """The command import from end to end: what a hospital sends becomes a patient's folder that names nobody."""
 
+from dataclasses import replace
+
 import nibabel
 import numpy as np
 import pytest
@@ -11,9 +13,10 @@ from synthetic_body import BODY, DIRECTIONS, LEFT, RIGHT, TUMOUR, coarsely, leve
 from app import main
 from errors import PatientError
 from scenes.anatomy import load_anatomy
+from scenes.import_findings import read_findings
 from scenes.patients.import_command import position_mm
 from scenes.patients.import_request import import_request, volume_of_labels
-from scenes.patients.patient_folder import is_identifying, save_patient
+from scenes.patients.patient_folder import is_identifying, save_patient, without_identifiers
 from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import LabelMap
@@ -94,9 +97,31 @@ def test_the_folder_is_a_scene(written):
     held = scene.attachment
     assert held.at_mm is not None and held.radius_mm == 20 and held.stiffness_n_mm == 2.0
     assert {file.name for file in written.iterdir()} == {
-        "check.png", "ct.nrrd", "labels.nrrd", "organ.stl", "scene.toml", "support.stl", "tumour.stl",
+        "check.png", "ct.nrrd", "import.json", "labels.nrrd", "organ.stl", "scene.toml", "support.stl", "tumour.stl",
     }  # fmt: skip
     assert [entry.name for entry in written.parent.iterdir()] == ["a"]
+
+
+def test_the_findings_are_kept(written, taken_in):
+    patient, found = taken_in[0], read_findings(written)
+    assert found.side == "left" and found.series == "1" and not found.draft
+    assert found.source.size == SIZE and found.ct.size == patient.ct.GetSize()
+    np.testing.assert_allclose(found.source.origin_mm, ORIGIN, atol=1e-3)
+    assert found.surfaces["organ"].label_ml == pytest.approx(patient.volumes_ml["organ"], abs=1e-3)
+    assert found.surfaces["tumour"].volume_ml == pytest.approx(patient.tumour.volume / 1000, abs=1e-3)
+    assert found.complexity["tumours"] == 1
+    assert list(found.open_warnings) == list(patient.warnings) and found.notes == patient.notes
+
+
+def test_notes_name_nobody(taken_in):
+    """Notes quote names of files and labels."""
+    names = dict.fromkeys(["Doe^Jane", "Doe", "Jane", "1.2.840.4711"], "")
+    patient = replace(
+        taken_in[0], notes=("slice 3 (doe_jane/IM1)", "of Doe^Jane"), warnings=("label 1.2.840.4711.dcm",)
+    )
+    found = without_identifiers(patient, names)
+    assert found.notes == ("slice 3 ([removed]_[removed]/IM1)", "of [removed]")
+    assert found.warnings == ("label [removed].dcm",)
 
 
 def test_nothing_names_the_patient(written, hospital):
@@ -123,7 +148,7 @@ def test_the_terminal_names_nobody_and_tells_the_facts(hospital, tmp_path, capfd
 def test_identifiers_of_the_source_are_collected(hospital, taken_in):
     folder, series = hospital
     identifiers = taken_in[1]
-    assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.uid, series.sops[0]} <= identifiers
+    assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.uid, series.sops[0]} <= {*identifiers}
     assert str(folder.resolve()) in identifiers
 
 
@@ -167,11 +192,25 @@ class TestIdentifiers:
     )
     def test_a_file_with_an_identifier_is_not_written(self, patient, tmp_path, identifier):
         texts = {"scene.toml": f'title = "kidney of {identifier}"\n'}
-        with pytest.raises(PatientError, match=r"scene\.toml would have contained an identifier") as caught:
-            save_patient(patient, tmp_path / "p", texts, identifiers={identifier, "Nobody"})
+        with pytest.raises(
+            PatientError,
+            match=r"scene\.toml would have contained the text of PatientName;.*remove it from a copy",
+        ) as caught:
+            save_patient(
+                patient,
+                tmp_path / "p",
+                texts,
+                identifiers=dict.fromkeys([identifier, "Nobody"], "PatientName"),
+            )
         assert identifier not in str(caught.value) and list(tmp_path.iterdir()) == []
         assert (
-            save_patient(patient, tmp_path / "p", {"scene.toml": ""}, identifiers={identifier, "Nobody"}) == 2
+            save_patient(
+                patient,
+                tmp_path / "p",
+                {"scene.toml": ""},
+                identifiers=dict.fromkeys([identifier, "Nobody"], "PatientName"),
+            )
+            == 2
         )
 
     def test_headers_of_images_and_surfaces_are_searched(self, patient, tmp_path):
@@ -180,17 +219,22 @@ class TestIdentifiers:
             organ.write_bytes(b"solid of Doe".ljust(80) + organ.read_bytes()[80:])
 
         with pytest.raises(PatientError, match=r"organ\.stl would have contained"):
-            save_patient(patient, tmp_path / "p", draw=draw, identifiers={"Doe"})
+            save_patient(patient, tmp_path / "p", draw=draw, identifiers={"Doe": "PatientName"})
         assert list(tmp_path.iterdir()) == []
 
     def test_words_of_every_file_name_nobody(self):
-        assert (
-            is_identifying("Doe")
-            and is_identifying("Left^Doe")
-            and is_identifying("123456")
-            and is_identifying("1.2.3")
-        )
-        assert not any(map(is_identifying, ["", "7", "AB", "12345", "kidney", "Left Kidney", "STL"]))
+        for text in ("Doe", "Left^Doe", "123456", "1.2.840.4711", "1960-02-29", "Ward 12", "Left 123456"):
+            assert is_identifying(text), text
+        for text in ("", "7", "AB", "12345", "kidney", "Left Kidney", "STL", "kidney 3.5 mm", "vein"):
+            assert not is_identifying(text), text
+
+    @pytest.mark.parametrize(
+        "text", ["15.0", "3.5", "0.45", "1-3", "0.3515625", "512\\512", "0.5, 0.25", "-110.0"]
+    )
+    def test_numbers_identify_nobody(self, patient, tmp_path, text):
+        """GE's private elements and series descriptions hold numbers that also stand in a scene."""
+        texts = {"scene.toml": f"window_hu = {text}\n"}
+        assert save_patient(patient, tmp_path / "p", texts, identifiers={text: "(0043,1063)"}) == 0
 
     def test_an_interrupted_import_leaves_nothing(self, patient, tmp_path):
         def draw(_):
@@ -237,7 +281,7 @@ def test_identifiers_of_each_source(hospital, taken_in):
     """The CT's header by itself, and the labels'."""
     folder, series = hospital
     for identifiers in (open_ct(folder / "ct").identifiers, open_labels(folder / "seg").identifiers):
-        assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.study} <= identifiers
+        assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.study} <= {*identifiers}
 
 
 def test_identifiers_of_labels_and_paths(hospital, taken_in, tmp_path, monkeypatch):
@@ -248,7 +292,21 @@ def test_identifiers_of_labels_and_paths(hospital, taken_in, tmp_path, monkeypat
     nibabel.save(made, tmp_path / "kidney.nii.gz")
     given = type(tmp_path)("../") / tmp_path.name / "kidney.nii.gz"
     identifiers = import_request(hospital[0] / "ct", [given])[1]
-    assert {"drawn by Roe", "Doe^Jane", str(given), str(tmp_path.resolve() / "kidney.nii.gz")} <= identifiers
+    assert {"drawn by Roe", "Doe^Jane", str(given), str(tmp_path.resolve() / "kidney.nii.gz")} <= {
+        *identifiers
+    }
+
+
+def test_a_value_that_no_voxel_has_is_noted(hospital, taken_in, tmp_path, monkeypatch):
+    monkeypatch.setattr("scenes.patients.import_request.import_patient", lambda *_, **__: taken_in[0])
+    sitk.WriteImage(sitk.Image([5, 5, 5], sitk.sitkUInt8) + 1, str(tmp_path / "kits.nii.gz"))
+    patient, _ = import_request(
+        hospital[0] / "ct", [tmp_path / "kits.nii.gz"], ["1", "2"], {"tumour": ["2"], "cyst": ["3"]}
+    )
+    assert patient.notes[-2:] == (
+        "no voxel has the tumour's label 2",
+        "no voxel has the cyst's label 3",
+    )
 
 
 def test_a_seed_makes_a_draft(hospital, taken_in, monkeypatch):
@@ -271,7 +329,7 @@ def test_what_one_header_says(tmp_path):
         data.private_block(0x0099, "MAKER", create=True).add_new(1, "LO", "Ward 12")
 
     identifiers = open_ct(Series(tmp_path).write(edit=edit)).identifiers
-    assert {"Roe^Ann", "Roe", "Ann", "calls himself Jim", "X-22", "St Elsewhere", "Ward 12"} <= identifiers
+    assert {"Roe^Ann", "Roe", "Ann", "calls himself Jim", "X-22", "St Elsewhere", "Ward 12"} <= {*identifiers}
 
 
 class TestSearch:
@@ -281,7 +339,7 @@ class TestSearch:
             (folder / "check.png").write_bytes(b"\0\1" + "Özgür Ünal".encode(encoding) + b"\2")
 
         with pytest.raises(PatientError, match=r"check\.png would have contained"):
-            save_patient(taken_in[0], tmp_path / "p", draw=draw, identifiers={"Özgür Ünal"})
+            save_patient(taken_in[0], tmp_path / "p", draw=draw, identifiers={"Özgür Ünal": "PatientName"})
 
     def test_packed_voxels_are_searched(self, taken_in, tmp_path):
         def draw(folder):
@@ -289,8 +347,13 @@ class TestSearch:
             sitk.WriteImage(words, str(folder / "labels.nrrd"), useCompression=True)
 
         with pytest.raises(PatientError, match=r"labels\.nrrd would have contained"):
-            save_patient(taken_in[0], tmp_path / "p", draw=draw, identifiers={"Doe^Jane"})
+            save_patient(taken_in[0], tmp_path / "p", draw=draw, identifiers={"Doe^Jane": "PatientName"})
 
     def test_a_word_within_another_names_nobody(self, taken_in, tmp_path):
         texts = {"scene.toml": 'title = "monroe\'s doer"\n'}
-        assert save_patient(taken_in[0], tmp_path / "p", texts, identifiers={"roe", "doe"}) == 2
+        assert (
+            save_patient(
+                taken_in[0], tmp_path / "p", texts, identifiers=dict.fromkeys(["roe", "doe"], "PatientName")
+            )
+            == 2
+        )

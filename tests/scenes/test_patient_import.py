@@ -8,6 +8,7 @@ import trimesh
 from synthetic_body import (
     DIRECTIONS,
     LEFT,
+    RIGHT,
     TUMOUR,
     assert_sound,
     body,
@@ -30,7 +31,7 @@ from scenes.patients.organ_selection import choose_organ, find_organs, midline_x
 from scenes.patients.patient_folder import save_patient
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.ct_series import open_ct
-from scenes.patients.readers.label_maps import LabelMap, assign_tissues
+from scenes.patients.readers.label_maps import LabelMap, absent_labels, assign_tissues
 from scenes.phantom import embedded_patient
 from scenes.scene import SceneError
 from scenes.volumes.lazy_volume import LazyVolume
@@ -50,7 +51,7 @@ def label_map(labels, organ=(), **tissues):
 
 def imported(ct, labels, organ=(), side=None, margin_mm=60.0, **tissues):
     labelled = label_map(labels, organ, **tissues)
-    return import_patient(LazyVolume.of(ct), *labelled, side, margin_mm, needed=set(tissues))
+    return import_patient(LazyVolume.of(ct), *labelled, side, margin_mm, given=tissues)
 
 
 def found(ct, labels, organ=(), side=None, **tissues):
@@ -194,15 +195,79 @@ class TestImport:
             import_patient(LazyVolume.of(ct), other)
 
 
+def voxels_of(labels, value):
+    """Number of voxels of a label, as ITK counts them."""
+    counts = sitk.LabelStatisticsImageFilter()
+    counts.Execute(labels, sitk.Cast(labels, sitk.sitkUInt8))
+    return counts.GetCount(value)
+
+
+@pytest.mark.usefixtures("without_support", "coarse")
+class TestOneCommandForManyPatients:
+    """KiTS: 1 = kidney, 2 = tumour, 3 = cyst, and not every patient has each of them."""
+
+    @pytest.fixture
+    def kits(self, ct_and_labels):
+        """Both kidneys have label 1; the left one has a tumour."""
+        return ct_and_labels[0], mapped(ct_and_labels[1], [0, 1, 1, 2])
+
+    @pytest.mark.parametrize("organ", [[1], [1, 2]], ids=["organ 1", "organ 1,2"])
+    def test_the_tumour_is_the_organs_however_it_is_given(self, kits, organ):
+        patient = imported(*kits, organ, "left", 20.0, tumour=[2])
+        voxel_ml = np.prod(kits[0].GetSpacing()) / 1000
+        assert patient.volumes_ml["tumour"] == pytest.approx(voxels_of(kits[1], 2) * voxel_ml)
+        assert patient.tissues[2] == "tumour" and (sitk.GetArrayViewFromImage(patient.labels) == 2).any()
+        assert patient.notes == patient.warnings == ()
+        # The left kidney's voxels, without the right kidney's.
+        own = sitk.GetArrayViewFromImage(kits[1])[points_of(kits[1])[..., 0] > 0]
+        assert patient.volumes_ml["organ"] == pytest.approx((own > 0).sum() * voxel_ml)
+
+    def test_a_tumour_in_the_other_kidney(self, kits):
+        patient = imported(*kits, [1, 2], "right", 20.0, tumour=[2])
+        assert patient.tumour is None and patient.warnings == ()
+        assert patient.notes == ("the tumour's label is only in the other kidney",)
+
+    def test_a_tumour_apart_from_both_is_left_out_and_is_no_third_organ(self, kits):
+        """Though it is as large as one."""
+        apart = drawn(kits[1], (1, LEFT), (1, RIGHT), (2, (np.array([0, -30.0, 40]), np.full(3, 20.0))))
+        patient = imported(kits[0], apart, [1, 2], "left", 20.0, tumour=[2])
+        assert patient.tumour is None and patient.notes == ()
+        (warning,) = patient.warnings
+        assert "the tumour's label touches no labelled kidney, and was left out" in warning
+
+    def test_vessels_far_away(self, kits):
+        far = drawn(kits[1], (1, LEFT), (2, TUMOUR), (4, (np.array([-40.0, 30, 0]), np.full(3, 9.0))))
+        patient = imported(kits[0], far, [1], "left", 20.0, tumour=[2], artery=[4])
+        assert patient.notes == ("the artery's label is more than 15 mm from this kidney",)
+
+    def test_a_label_that_no_voxel_has(self, kits):
+        """A note from the words, not from the voxels of one kidney."""
+        maps = [LabelMap.of(kits[1])]
+        chosen = {"tumour": ["2"], "cyst": ["3", "4"]}
+        (assigned,) = assign_tissues(maps, ["1", "2"], chosen)
+        assert [s.tissue for s in assigned.segments.values()] == ["kidney", "tumour"]
+        assert absent_labels(maps, chosen) == (
+            "no voxel has the cyst's label 3",
+            "no voxel has the cyst's label 4",
+        )
+        assert absent_labels(maps, {"tumour": ["2"]}) == ()
+        # The organ's own label must be there, but not the tumour's, of those that are given as both.
+        (healthy,) = assign_tissues([LabelMap.of(mapped(kits[1], [0, 1, 0]))], ["1", "2"], {"tumour": ["2"]})
+        assert list(healthy.segments) == [1]
+
+
 class TestImportRefuses:
     @pytest.mark.parametrize(
         ("options", "words"),
         [
             ({}, r"2 organs .*label 1, right, \d+\.\d ml; label 2\+3, left, \d+\.\d ml.*--side"),
             ({"organ": [5]}, "label 5 is not in the label map: it has 1, 2, 3; give one of these"),
-            ({"tumour": [8], "organ": [1]}, "tumour's label 8 is not"),
-            ({"organ": [1, 3], "tumour": [3]}, "label 3 is given as organ and as tumour"),
-            ({"organ": [1], "tumour": [3]}, "the tumour does not touch the organ"),
+            (
+                {"organ": [3], "tumour": [3]},
+                "labels are only those of tumours and cysts; give the kidney's own",
+            ),
+            ({"organ": [1, 5], "tumour": [3]}, "the organ's label 5 is not in the label map"),
+            ({"tumour": ["mass"], "organ": [1]}, "the tumour's label mass is not in the label map"),
             ({"organ": [1], "side": "left"}, "no left kidney is labelled, found: label 1, right"),
             ({"organ": [3]}, r"has 5\.\d ml: expected 20 to 2000 ml"),
             ({"organ": [2], "margin_mm": -1.0}, "margin"),

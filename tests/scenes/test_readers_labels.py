@@ -2,6 +2,7 @@
 
 import gzip
 import shutil
+from dataclasses import replace
 
 import nibabel
 import numpy as np
@@ -187,6 +188,9 @@ class TestLabelMaps:
         assert np.array_equal(found["Kidney L"], layers[..., 0] == 1)
         assert np.array_equal(found["aorta"], layers[..., 0] == 2)
         assert np.array_equal(found["renal mass"], layers[..., 1] == 1)
+        assert [
+            s.name for s in open_labels(slicer("Segment3_Name:=GTV\nSegment3_LabelValue:=7")[0]).empty
+        ] == ["GTV"]
         segments = {s.name: s for one in maps for s in one.segments.values()}
         assert segments["Kidney L"] == Segment("Kidney L", 1, "kidney", "left", (0.5, 0.25, 1.0))
         assert segments["renal mass"].tissue == "tumour" and segments["aorta"].value == 2
@@ -211,6 +215,7 @@ class TestLabelMaps:
         (tmp_path / "brain.nii.gz").write_bytes(b"never read")
         found = by_name(open_labels(tmp_path).maps(None), VoxelGrid.of(empty))
         assert set(found) == {"kidney_left", "liver"}
+        assert {s.name for s in open_labels(tmp_path).empty} == {"kidney_right", "kidney_cyst_left"}
         assert np.array_equal(found["kidney_left"], sitk.GetArrayFromImage(drawn(empty, (1, KIDNEY))) == 1)
         refusal(tmp_path, read=lambda path: open_labels(path, wanted=["Brain"]), name="brain.nii.gz")
 
@@ -364,7 +369,17 @@ class TestTogether:
         ):
             assign_tissues(maps, ["4"], {})
         with pytest.raises(PatientError, match="given as cyst and as tumour: give it as one"):
-            assign_tissues(maps, [], {"cyst": ["mass"], "tumour": ["mass"]})
+            assign_tissues(maps, ["mass"], {"cyst": ["mass"], "tumour": ["mass"]})
+        # A number is a typing error where segments have names alone, and a name unless its segment is empty.
+        unnumbered = [
+            replace(one, segments={1: Segment.named(s.name)}) for one in maps for s in one.segments.values()
+        ]
+        for given, word in ((maps, "cyst"), (unnumbered, "2")):
+            with pytest.raises(PatientError, match=f"the cyst's label {word} is not in the label map"):
+                assign_tissues(given, [], {"cyst": [word]})
+        assert assign_tissues(maps, [], {"cyst": ["cyst"]}, [Segment.named("Cyst")]) == maps
+        with pytest.raises(PatientError, match="the organ's label kidney_right is not in the label map"):
+            assign_tissues(maps, ["kidney_right"], {}, [Segment.named("kidney_right")])
         plain = LabelMap.of(drawn(grid_around((-33, 18, -401), (-22, 30, -385), (1, 1, 1)), (5, KIDNEY)))
         (assigned,) = assign_tissues([plain], ["5"], {})
         assert assigned.segments[5].tissue == "kidney"

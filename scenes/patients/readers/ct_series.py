@@ -166,6 +166,7 @@ def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume
         stack,
         notes=(*notes, *stack.notes),
         references=series.references,
+        series=series.number,
         identifiers=identifiers_of(slices[0].item),
     )
 

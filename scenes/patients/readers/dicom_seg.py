@@ -55,7 +55,8 @@ def read_segmentation(
         segmentation = hd.seg.Segmentation.from_dataset(data, copy=False)
         segments = _segments(segmentation)
         left_out = [one for one in segments if is_left_out(one, wanted)]
-        maps, grid = _maps(item, segmentation, [one for one in segments if one not in left_out], progress)
+        kept = [one for one in segments if one not in left_out]
+        maps, grid = _maps(item, segmentation, kept, progress)
     if not maps:
         raise PatientError(
             f"{item.name}: is empty, no voxel is labelled; expected an organ; choose another file"
@@ -68,6 +69,7 @@ def read_segmentation(
         identifiers=identifiers_of(item),
         references=references,
         grid=grid,
+        empty=tuple(one for one in kept if all(one not in each.segments.values() for each in maps)),
     )
 
 

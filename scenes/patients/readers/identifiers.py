@@ -21,18 +21,22 @@ PERSONAL_KEYWORDS = (
 )  # fmt: skip
 
 
-def identifiers_of(item: SourceFile) -> frozenset[str]:
-    """Names, IDs, dates, institutions, UIDs and private texts of one DICOM file; elements that cannot be parsed as raw text."""
-    return frozenset(text for text in _texts(item.header(None)) if text)
+def identifiers_of(item: SourceFile) -> dict[str, str]:
+    """Names, IDs, dates, institutions, UIDs and private texts of one DICOM file, and the element of each, in words.
+
+    Elements that cannot be parsed are taken as raw text.
+    """
+    return {text: place for text, place in _texts(item.header(None)) if text}
 
 
-def _texts(data: Dataset) -> Iterator[str]:
+def _texts(data: Dataset) -> Iterator[tuple[str, str]]:
     for tag in sorted(data.keys() - {CONTOUR_DATA}):
+        place = f"the DICOM element {tag}"
         try:
             element = data[tag]
             nested = list(element.value) if element.VR == "SQ" else []
         except Exception:  # a parser raises many kinds of error
-            yield from _plain(getattr(data.get_item(tag), "value", None))
+            yield from ((text, place) for text in _plain(getattr(data.get_item(tag), "value", None)))
             continue
         if element.VR == "SQ":
             for one in nested:
@@ -40,7 +44,8 @@ def _texts(data: Dataset) -> Iterator[str]:
             continue
         personal = element.tag.is_private or any(word in element.keyword for word in PERSONAL_KEYWORDS)
         if element.VR in NAMING or (element.VR in FREE_TEXT and personal):
-            yield from _words(element)
+            place = f"{place} {element.keyword or '(private)'}"
+            yield from ((text, place) for text in _words(element))
 
 
 def _words(element: DataElement) -> Iterator[str]:

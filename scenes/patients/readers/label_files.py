@@ -102,11 +102,12 @@ def _label_map_file(path: Path) -> Segmentation:
     voxels = volume.read()
     layers = [voxels] if voxels.ndim == 3 else np.moveaxis(voxels, -1, 0)
     names = _names(volume)
+    unused = dict(names)
     maps = []
     for layer, one in enumerate(layers):
         if one.any() or len(layers) == 1:
             values = whole_numbers(one, str(path))
-            segments = {v: names.get((layer, v)) or Segment.named("", v) for v in present_values(values)}
+            segments = {v: unused.pop((layer, v), Segment.named("", v)) for v in present_values(values)}
             maps.append(LabelMap(volume.grid, values, segments))
     if not maps:
         raise PatientError(f"{path}: is empty, no voxel is labelled; expected an organ; choose another file")
@@ -114,7 +115,9 @@ def _label_map_file(path: Path) -> Segmentation:
     if not names and len(maps[0].segments) == len(maps) == 1 and (tissue_of(stem) or side_of(stem)):
         (value,) = maps[0].segments
         maps = [replace(maps[0], segments={value: Segment.named(stem, value)})]
-    return Segmentation(lambda _: maps, identifiers=volume.identifiers, grid=volume.grid)
+    return Segmentation(
+        lambda _: maps, identifiers=volume.identifiers, grid=volume.grid, empty=tuple(unused.values())
+    )
 
 
 def _names(volume: LazyVolume) -> dict[tuple[int, int], Segment]:
@@ -148,7 +151,8 @@ def _file_per_organ(
     # Kidneys first: of the others only the part near them is read.
     near.sort(key=lambda file: tissue_of(_stem(file)) != "kidney")
     maps: list[LabelMap] = []
-    identifiers: set[str] = set()
+    empty: list[Segment] = []
+    identifiers: dict[str, str] = {}
     around: np.ndarray | None = None
     for file in progress(near, "labels"):
         volume = file_volume(file)
@@ -163,6 +167,8 @@ def _file_per_organ(
                 # Fractions, or an image among the labels, are refused.
                 inside = whole_numbers(voxels, str(file)) > 0
                 maps.append(LabelMap.single(volume.grid.part(box), inside, Segment.named(_stem(file))))
+            else:
+                empty.append(Segment.named(_stem(file)))
         if is_kidney and maps:
             places = np.concatenate([m.grid.corners() for m in maps])
             around = np.array([places.min(axis=0) - NEAR_MM, places.max(axis=0) + NEAR_MM])
@@ -170,7 +176,7 @@ def _file_per_organ(
         raise PatientError(
             f"{folder}: all {len(near)} label files are empty; expected an organ; choose other labels"
         )
-    return Segmentation(lambda _: maps, identifiers=frozenset(identifiers), grid=volume.grid)
+    return Segmentation(lambda _: maps, identifiers=identifiers, grid=volume.grid, empty=tuple(empty))
 
 
 def _stem(path: Path) -> str:

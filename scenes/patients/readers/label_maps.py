@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import SimpleITK as sitk
@@ -92,9 +92,10 @@ class Segmentation:
 
     maps: Callable[[VoxelGrid], list[LabelMap]]  # on the CT's grid
     notes: tuple[str, ...] = ()
-    identifiers: frozenset[str] = frozenset()
+    identifiers: Mapping[str, str] = field(default_factory=dict)  # as those of ``LazyVolume``
     references: DicomReferences = NO_REFERENCES  # the DICOM objects that they refer to
     grid: VoxelGrid | None = None  # of label maps: all voxels of the first
+    empty: tuple[Segment, ...] = ()  # segments that no voxel has
 
 
 def is_left_out(segment: Segment, wanted: Collection[str], is_tissue: bool = True) -> bool:
@@ -128,41 +129,72 @@ def whole_numbers(voxels: np.ndarray, name: str) -> np.ndarray:
 
 
 def assign_tissues(
-    maps: list[LabelMap], organ: Sequence[str], chosen: Mapping[str, Sequence[str]]
+    maps: list[LabelMap],
+    organ: Sequence[str],
+    chosen: Mapping[str, Sequence[str]],
+    empty: Sequence[Segment] = (),
 ) -> list[LabelMap]:
     """The maps with the tissues that the user assigned, by names or values.
+
+    A label given as the organ and as a tissue is the tissue. A tissue's value, or its segment in ``empty``, may be absent
+    (``absent_labels``), so that one command is right for many patients.
 
     Args:
         maps: all label maps.
         organ: segments of the organ; those without a tissue become kidney.
         chosen: tissue -> all of its segments.
+        empty: segments of the files that no voxel has.
 
     Raises:
-        PatientError: an unknown name or value, or one segment given twice.
+        PatientError: an absent label of the organ, a name that no segment has, or one segment given as two tissues.
     """
-    segments = [segment for one in maps for segment in one.segments.values()]
-    given = {"organ": organ, **chosen}
-    for option, words in given.items():
+    segments = _segments(maps)
+    has_values = any(segment.value is not None for segment in segments)
+    of_tissues = {word for words in chosen.values() for word in words}
+    for option, words in {"organ": [word for word in organ if word not in of_tissues], **chosen}.items():
         for word in words:
-            if not any(segment.matches(word) for segment in segments):
+            may_be_absent = option != "organ" and (
+                (has_values and word.isdecimal()) or _is_among(empty, word)
+            )
+            if not may_be_absent and not _is_among(segments, word):
                 raise PatientError(
                     f"the {option}'s label {word} is not in the label map: it has {listed([str(s) for s in segments])}; "
                     "give one of these"
                 )
 
     def assigned(segment: Segment) -> Segment:
-        found = [option for option, words in given.items() if any(segment.matches(word) for word in words)]
+        found = [tissue for tissue, words in chosen.items() if any(segment.matches(word) for word in words)]
         if len(found) > 1:
             raise PatientError(
                 f"label {segment} is given as {' and as '.join(found)}: give it as one of them"
             )
-        if found and found[0] != "organ":
+        if found:
             return replace(segment, tissue=found[0])
         if segment.tissue in chosen:
             segment = replace(segment, tissue=None)
-        return replace(segment, tissue=segment.tissue or "kidney") if found else segment
+        is_organ = any(segment.matches(word) for word in organ)
+        return replace(segment, tissue=segment.tissue or "kidney") if is_organ else segment
 
     return [replace(one, segments={v: assigned(s) for v, s in one.segments.items()}) for one in maps]
+
+
+def absent_labels(maps: list[LabelMap], chosen: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
+    """A note for each label of a tissue (tissue -> names or values of its labels) that no voxel has."""
+    segments = _segments(maps)
+    return tuple(
+        f"no voxel has the {tissue}'s label {word}"
+        for tissue, words in chosen.items()
+        for word in words
+        if not _is_among(segments, word)
+    )
+
+
+def _segments(maps: list[LabelMap]) -> list[Segment]:
+    return [segment for one in maps for segment in one.segments.values()]
+
+
+def _is_among(segments: Sequence[Segment], word: str) -> bool:
+    return any(segment.matches(word) for segment in segments)
 
 
 def merge_label_maps(maps: list[LabelMap]) -> LabelMap:

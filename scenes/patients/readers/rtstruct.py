@@ -69,7 +69,13 @@ def read_structures(
             )
         return filled
 
-    return Segmentation(maps, notes=notes, identifiers=identifiers_of(item), references=references)
+    return Segmentation(
+        maps,
+        notes=notes,
+        identifiers=identifiers_of(item),
+        references=references,
+        empty=tuple(segment for segment, points in contours if not points),
+    )
 
 
 def _regions(data: Dataset) -> list[tuple[Segment, Dataset, str]]:

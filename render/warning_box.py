@@ -1,0 +1,56 @@
+"""The box with the warnings of an import, over the foot of the 3D view."""
+
+from functools import lru_cache
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from render.text import font
+from render.ultrasound_panel import ALERT, FINDINGS
+from render.window_layout import FIGURE_HEIGHT, FIGURES_PAD, Rect, WindowLayout
+
+LETTERS_PX = 13
+# The box covers at most this share of the 3D view.
+MOST_SHARE = 0.4
+
+
+def warning_rect(layout: WindowLayout, warnings: tuple[str, ...]) -> Rect | None:
+    """The box of some warnings; None without any."""
+    if not warnings:
+        return None
+    room, pitch = layout.foot, layout.px(FIGURE_HEIGHT)
+    height = len(warning_lines(layout, warnings)) * pitch + 2 * FIGURES_PAD
+    return Rect(room.left, room.bottom - height, room.width, height)
+
+
+@lru_cache(maxsize=8)
+def warning_lines(layout: WindowLayout, warnings: tuple[str, ...]) -> list[str]:
+    """The lines of some warnings; of very long ones the last lines are left out."""
+    letters, room = font(layout.px(LETTERS_PX)), layout.foot.width - 2 * layout.px(10)
+    lines: list[str] = []
+    for warning in warnings:
+        line = ""
+        for word in warning.split():
+            longer = f"{line} {word}".strip()
+            if line and letters.getlength(longer) > room:
+                lines.append(line)
+                longer = word
+            line = longer
+        lines.append(line)
+    most = max(1, int((MOST_SHARE * layout.scene.height - 2 * FIGURES_PAD) / layout.px(FIGURE_HEIGHT)))
+    return lines if len(lines) <= most else [*lines[: most - 1], "..."]
+
+
+@lru_cache(maxsize=8)
+def warning_image(layout: WindowLayout, warnings: tuple[str, ...]) -> np.ndarray:
+    """The box as an image, uint8, shape (height, width, 3). Raises ValueError without a warning."""
+    box = warning_rect(layout, warnings)
+    if box is None:
+        raise ValueError("expected one warning or more")
+    image = Image.new("RGB", (box.width, box.height), FINDINGS)
+    draw = ImageDraw.Draw(image)
+    draw.rectangle([0, 0, box.width - 1, box.height - 1], outline=ALERT)
+    for place, line in enumerate(warning_lines(layout, warnings)):
+        middle = FIGURES_PAD + (place + 0.5) * layout.px(FIGURE_HEIGHT)
+        draw.text((layout.px(10), middle), line, font=font(layout.px(LETTERS_PX)), fill=ALERT, anchor="lm")
+    return np.asarray(image)

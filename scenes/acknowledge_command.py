@@ -1,0 +1,31 @@
+"""The command ``acknowledge``: marks the warnings of an import as checked by the user."""
+
+from pathlib import Path
+
+import click
+
+from scenes.import_findings import acknowledge, read_findings
+from scenes.scene import SceneError, scene_file
+
+
+@click.command("acknowledge")
+@click.argument("patient", type=click.Path(path_type=Path))
+@click.option("--yes", is_flag=True, help="Do not ask.")
+def acknowledge_command(patient: Path, yes: bool) -> None:
+    """Mark the warnings of PATIENT's import as checked.
+
+    PATIENT is the folder that import made. Its warnings are then no longer shown.
+    """
+    folder = scene_file(patient).parent
+    findings = read_findings(folder)
+    if findings is None:
+        raise SceneError(f"{folder}: has no import.json; expected a patient's folder, made by app.py import")
+    if not findings.open_warnings:
+        click.echo("There is no warning to acknowledge.")
+        return
+    for text in findings.open_warnings:
+        click.echo(f"WARNING of the import: {text}")
+    if not yes:
+        click.confirm(f"Did you check this in {folder / 'check.png'}?", abort=True)
+    acknowledge(folder)
+    click.echo("Acknowledged: no longer shown.")

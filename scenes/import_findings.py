@@ -1,0 +1,112 @@
+"""The findings of an import: ``import.json`` in a patient's folder. Its warnings are shown until the user acknowledges them."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import ValidationError
+
+from errors import explained
+from scenes.atomic_files import atomic_write
+from scenes.scene import Scene, SceneError
+from scenes.section import Section, Vector3
+from scenes.terminal import shell_command
+
+FINDINGS_FILE = "import.json"
+
+
+class ImportWarning(Section):
+    """What looks wrong in the CT and its labels, or was assumed, and whether the user has acknowledged it."""
+
+    text: str
+    acknowledged: bool = False
+
+
+class GridFindings(Section):
+    """A voxel grid in LPS [mm]; ``direction`` has the three axes of the voxels as columns, row by row."""
+
+    size: tuple[int, int, int]
+    spacing_mm: Vector3
+    origin_mm: Vector3
+    direction: tuple[Vector3, Vector3, Vector3]
+
+
+class SurfaceFindings(Section):
+    """A closed surface, and the volume that its label has."""
+
+    faces: int
+    volume_ml: float
+    label_ml: float | None = None
+
+
+class ImportFindings(Section):
+    """What an import found. No name, ID, date, UID or path of the patient."""
+
+    version: str
+    side: Literal["left", "right"]
+    draft: bool
+    extent_mm: Vector3
+    """Of the organ: right-left, front-back, foot-head."""
+    surfaces: dict[str, SurfaceFindings]
+    """Of the organ, its parts by tissue, and the support."""
+    series: str
+    """Number of the CT's series; empty without one."""
+    source: GridFindings
+    """The CT as it was given, before it was cropped around the organ."""
+    ct: GridFindings
+    """The CT and the labels in the folder."""
+    tissues: dict[str, str]
+    """Tissue of each value of the labels in the folder."""
+    complexity: dict[str, Any] | None
+    """Of the tumour, as in report.json; None without a tumour."""
+    warnings: tuple[ImportWarning, ...]
+    notes: tuple[str, ...]
+    """What was chosen, left out or resampled."""
+
+    @property
+    def open_warnings(self) -> tuple[str, ...]:
+        """The warnings that nobody has acknowledged."""
+        return tuple(each.text for each in self.warnings if not each.acknowledged)
+
+
+def findings_text(findings: ImportFindings) -> str:
+    """The content of ``import.json``."""
+    return findings.model_dump_json(indent=2) + "\n"
+
+
+def read_findings(folder: Path) -> ImportFindings | None:
+    """The findings in a patient's folder; None where there are none, as before version 2. Raises SceneError."""
+    path = folder / FINDINGS_FILE
+    try:
+        return ImportFindings.model_validate_json(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read ({error.strerror}); check that it can be read") from None
+    except ValidationError as error:
+        raise SceneError(
+            f"{path}: {explained(error)}; expected the findings of app.py import; import the patient again, or remove this file and its "
+            "warnings"
+        ) from None
+
+
+def open_warnings(scene: Scene, folder: Path) -> tuple[str, ...]:
+    """The warnings of a scene's import that nobody has acknowledged. Raises SceneError."""
+    findings = None if scene.anatomy.phantom else read_findings(folder)
+    return () if findings is None else findings.open_warnings
+
+
+def acknowledge(folder: Path) -> None:
+    """Mark all warnings of a patient's folder as acknowledged. Raises SceneError, OSError."""
+    findings = read_findings(folder)
+    if findings is not None:
+        checked = tuple(each.model_copy(update=dict(acknowledged=True)) for each in findings.warnings)
+        with atomic_write(folder / FINDINGS_FILE) as partial:
+            partial.write_text(findings_text(findings.model_copy(update=dict(warnings=checked))), "utf-8")
+
+
+def warning_lines(warnings: tuple[str, ...], folder: Path) -> list[str]:
+    """Warnings for the terminal, and how to acknowledge them."""
+    if not warnings:
+        return []
+    how = f"Check {folder / 'check.png'}, then: {shell_command('acknowledge', folder)}"
+    return [*(f"WARNING of the import: {text}" for text in warnings), how]

@@ -1,0 +1,92 @@
+"""The listing of ``import --list``: CT series and labels of the user's paths, before anything is made."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from tabulate import tabulate
+
+from errors import PatientError
+from scenes.patients.readers.ct_series import CtListing, LabelsRow, SeriesRow, list_ct
+from scenes.patients.readers.label_files import open_labels
+from scenes.patients.readers.label_maps import LabelMap
+from scenes.terminal import Progress, silent
+from scenes.volumes.voxel_grid import VoxelGrid
+
+SERIES_HEADS = ("series", "slices", "spacing, mm", "pixels, mm", "extent, mm", "view", "patient")
+SEGMENT_HEADS = ("value", "name", "tissue", "side", "ml")
+MOST_NAMES = 12
+# Label maps do not ask for the CT's grid.
+AS_THEY_ARE = VoxelGrid((1, 1, 1), np.ones(3), np.zeros(3), np.eye(3))
+
+
+def listing_text(ct: Path, labels: Sequence[Path] = (), progress: Progress = silent) -> str:
+    """CT series and labels as tables: without any name, ID or date of the patient, but with the names of files and labels.
+
+    Raises PatientError: a path that cannot be read.
+    """
+    listed = list_ct(ct, progress)
+    faults = [f"series {_name(row)} cannot be imported: {row.fault}" for row in listed.series if row.fault]
+    parts = [_series_table(listed), "\n".join(faults), _labels_table(listed.labels)]
+    parts += [_labels_text(path, progress) for path in labels]
+    return "\n\n".join(filter(None, parts))
+
+
+def _series_table(listed: CtListing) -> str:
+    if not listed.series:
+        return "no CT series"
+    rows = [_series_row(row) for row in listed.series]
+    several = len({row.patient for row in listed.series}) > 1
+    shown = [n for n, head in enumerate(SERIES_HEADS) if head != "patient" or several]
+    return tabulate(
+        [[row[n] for n in shown] for row in rows],
+        [SERIES_HEADS[n] for n in shown],
+        disable_numparse=True,
+        colalign=["left"] * len(shown),
+    )
+
+
+def _series_row(row: SeriesRow) -> tuple[str, ...]:
+    spacing = "" if row.spacing_mm is None else f"{row.spacing_mm:.2f}"
+    pixels = "" if row.pixel_mm is None else "{:.2f} x {:.2f}".format(*row.pixel_mm)
+    extent, patient = f"{row.extent_mm:.0f}", str(row.patient)
+    return _name(row), str(row.slices), spacing, pixels, extent, row.orientation, patient
+
+
+def _name(row: SeriesRow) -> str:
+    return f"{row.number or 'file'}{f', UID ends in {row.uid_end}' if row.uid_end else ''}"
+
+
+def _labels_table(rows: list[LabelsRow]) -> str:
+    """DICOM labels, a line each."""
+    lines = []
+    for row in rows:
+        more = f" and {len(row.segments) - MOST_NAMES} more" if len(row.segments) > MOST_NAMES else ""
+        names = ", ".join(row.segments[:MOST_NAMES]) or "no segment"
+        of = f"; of series {', '.join(row.series)}" if row.series else ""
+        lines.append(f"{row.kind} {row.file}: {row.fault or names + more}{of}")
+    return "\n".join(lines)
+
+
+def _labels_text(path: Path, progress: Progress) -> str:
+    """The labels of one path: their segments with volumes; of DICOM, which needs its CT for that, the names."""
+    if of_dicom := _dicom_labels(path, progress):
+        return of_dicom
+    maps = open_labels(path, progress=progress).maps(AS_THEY_ARE)
+    rows = [row for one in maps for row in _segment_rows(one)]
+    return f"{path.name}:\n" + tabulate(rows, SEGMENT_HEADS, floatfmt=".1f")
+
+
+def _dicom_labels(path: Path, progress: Progress) -> str:
+    try:
+        return _labels_table(list_ct(path, progress).labels)
+    except PatientError:
+        return ""
+
+
+def _segment_rows(one: LabelMap) -> list[tuple]:
+    counts = np.bincount(one.values.ravel(), minlength=1 + max(one.segments))
+    return [
+        (segment.value, segment.name, segment.tissue, segment.side, counts[value] * one.grid.voxel_ml)
+        for value, segment in one.segments.items()
+    ]
