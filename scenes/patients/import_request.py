@@ -9,14 +9,17 @@ import numpy as np
 
 from errors import PatientError
 from scenes.patients.patient_import import Patient, import_patient
-from scenes.patients.readers.ct_series import open_ct, read_dicom_headers
+from scenes.patients.readers.ct_series import ct_candidates, open_ct, read_dicom_headers
+from scenes.patients.readers.dicom_headers import DicomContents
 from scenes.patients.readers.label_files import Segmentation, open_labels, segmentation_of
 from scenes.patients.readers.label_maps import absent_labels, assign_tissues, merge_label_maps
 from scenes.patients.readers.segment_names import Side
+from scenes.patients.readers.series_choice import choose_series
 from scenes.patients.region_growing import draft_segmentation
 from scenes.terminal import Progress, silent
-from scenes.volumes.dicom_references import NO_REFERENCES, doubts, mismatch
+from scenes.volumes.dicom_references import NO_REFERENCES, DicomReferences, doubts, mismatch
 from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.volume_files import is_volume_file
 
 
 def import_request(
@@ -50,8 +53,10 @@ def import_request(
     segmentations: list[Segmentation] = []
     absent: tuple[str, ...] = ()
     if seed_mm is None:
-        segmentations = _segmentations(ct, labels, [*organ, *chain(*tissues.values())], progress)
-        volume = volume_of_labels(ct, segmentations, series, progress)
+        contents = None if ct.is_file() and is_volume_file(ct) else read_dicom_headers(ct, progress)
+        words = [*organ, *chain(*tissues.values())]
+        segmentations = _segmentations(ct, contents, labels, series, words, progress)
+        volume = volume_of_labels(ct, segmentations, series, progress, contents)
         maps = [one for segmentation in segmentations for one in segmentation.maps(volume.grid)]
         empty = [segment for segmentation in segmentations for segment in segmentation.empty]
         merged = merge_label_maps(assign_tissues(maps, organ, tissues, empty))
@@ -83,12 +88,25 @@ def _identifiers(
 
 
 def _segmentations(
-    ct: Path, labels: Sequence[Path], words: list[str], progress: Progress
+    ct: Path,
+    contents: DicomContents | None,
+    labels: Sequence[Path],
+    series: str | None,
+    words: list[str],
+    progress: Progress,
 ) -> list[Segmentation]:
-    """The segmentations of the paths, else the one in the CT's folder."""
+    """The segmentations of the paths, else the one among the DICOM files of the CT."""
+    candidates = ct_candidates(ct, contents) if contents else []
+    if series is not None and candidates:
+        candidates = [choose_series(ct, candidates, series)[0]]
+    own = [one.references for one in candidates]
+
+    def belongs(references: DicomReferences) -> bool:
+        return not own or any(not mismatch(references, one) for one in own)
+
     if labels:
-        return [open_labels(path, words, progress) for path in labels]
-    found = segmentation_of(read_dicom_headers(ct, progress)) if ct.is_dir() else None
+        return [open_labels(path, words, progress, belongs) for path in labels]
+    found = segmentation_of(contents, words, progress, belongs) if contents else None
     if found is None:
         raise PatientError(
             f"{ct}: no labels are with this CT; give a file or folder with LABELS, or --seed X,Y,Z for a draft"
@@ -97,12 +115,16 @@ def _segmentations(
 
 
 def volume_of_labels(
-    ct: Path, segmentations: list[Segmentation], series: str | None = None, progress: Progress = silent
+    ct: Path,
+    segmentations: list[Segmentation],
+    series: str | None = None,
+    progress: Progress = silent,
+    contents: DicomContents | None = None,
 ) -> LazyVolume:
     """The CT that the labels were drawn on. Raises PatientError where they belong to another."""
     labels = next((s.references for s in segmentations if s.references != NO_REFERENCES), NO_REFERENCES)
     grid = next((s.grid for s in segmentations if s.grid), None)
-    volume = open_ct(ct, series, labels, grid, progress)
+    volume = open_ct(ct, series, labels, grid, progress, contents)
     for segmentation in segmentations:
         fault = mismatch(segmentation.references, volume.references)
         if fault:

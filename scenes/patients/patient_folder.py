@@ -26,6 +26,9 @@ REDACTED = "[removed]"
 # Texts of this length do not occur in voxels or triangles by chance.
 SURE_BYTES = 7
 ENCODINGS = ("utf-8", "utf-16-le", "latin-1")
+# Labels name the UIDs of a thousand slices: those are searched for in the digits of a file alone.
+UID = re.compile(r"[0-9.]+")
+NUMBERS = re.compile(rb"(?:[0-9.]\0?){4,}")
 GZIP = 31  # zlib's wbits for gzip
 COMMON = "left right kidney cyst vessels collecting system STL LPS ITK NRRD complete type int short unsigned char gzip space mm ml HU CT"
 
@@ -77,8 +80,9 @@ def _search(folder: Path, identifiers: Mapping[str, str]) -> int:
     wanted = {text: place for text, place in identifiers.items() if is_identifying(text)}
     for file in sorted(folder.iterdir()):
         words, everything = _contents(file)
+        numbers = b"\n".join(NUMBERS.findall(everything))
         for text, place in wanted.items():
-            if _holds(words, everything, text):
+            if _holds(words, numbers if UID.fullmatch(text) else everything, text):
                 raise PatientError(
                     f"{file.name} would have contained the text of {place}; expected no text of the source, which may identify the "
                     "patient; nothing was written; if that text identifies nobody, remove it from a copy of the source and import that; "

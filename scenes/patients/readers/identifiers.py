@@ -11,6 +11,8 @@ from scenes.patients.readers.dicom_files import SourceFile
 NAMING = ("PN", "DA", "DT", "UI")
 FREE_TEXT = ("LO", "SH", "ST", "LT", "UT", "UC", "UN", "AE")
 STANDARD_UID = "1.2.840.10008."
+# Coordinates, which identify nobody, and of which a structure set has a million.
+CONTOUR_DATA = 0x30060050
 # Public elements of free text that may identify a person; the others describe the scanner.
 PERSONAL_KEYWORDS = (
     "Patient", "Physician", "Operator", "Institution", "Accession", "StudyID", "StudyDescription", "SeriesDescription",
@@ -28,7 +30,7 @@ def identifiers_of(item: SourceFile) -> dict[str, str]:
 
 
 def _texts(data: Dataset) -> Iterator[tuple[str, str]]:
-    for tag in sorted(data.keys()):
+    for tag in sorted(data.keys() - {CONTOUR_DATA}):
         place = f"the DICOM element {tag}"
         try:
             element = data[tag]

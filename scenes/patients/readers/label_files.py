@@ -1,7 +1,7 @@
 """Read labels: label maps, folders with one file per organ, 3D Slicer's .seg.nrrd, DICOM-SEG, RTSTRUCT."""
 
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,28 +11,44 @@ from errors import PatientError
 from scenes.patients.readers.ct_series import read_dicom_headers
 from scenes.patients.readers.dicom_headers import DicomContents
 from scenes.patients.readers.dicom_seg import read_segmentation
-from scenes.patients.readers.label_maps import LabelMap, Segment, Segmentation, present_values, whole_numbers
+from scenes.patients.readers.label_headers import label_header
+from scenes.patients.readers.label_maps import (
+    NEAR_MM,
+    LabelMap,
+    Segment,
+    Segmentation,
+    present_values,
+    whole_numbers,
+)
 from scenes.patients.readers.rtstruct import read_structures
 from scenes.patients.readers.segment_names import is_far, side_of, tissue_of
 from scenes.terminal import Progress, silent
+from scenes.volumes.dicom_references import DicomReferences
 from scenes.volumes.lazy_volume import LazyVolume
 from scenes.volumes.volume_files import ENDINGS, file_volume, is_volume_file
 
-# An import keeps 60 mm around its organ.
-NEAR_MM = 80.0
 SLICER_KEY = re.compile(r"Segment(\d+)_Name$")
 
 
 READERS = {"SEG": read_segmentation, "RTSTRUCT": read_structures}
+# Whether labels that refer to these objects can belong to the CT.
+Belongs = Callable[[DicomReferences], bool]
 
 
-def open_labels(path: Path, wanted: Collection[str] = (), progress: Progress = silent) -> Segmentation:
+def open_labels(
+    path: Path,
+    wanted: Collection[str] = (),
+    progress: Progress = silent,
+    belongs: Belongs = lambda references: True,
+) -> Segmentation:
     """Read labels.
 
     Args:
         path: a label map or .seg.nrrd file, a folder with one file per organ, a DICOM-SEG or RTSTRUCT, or a folder or
             archive with one of these.
-        wanted: files of a folder to read, whatever their names.
+        wanted: names or values of segments, or files of a folder, to read, whatever their names.
+        progress: shows the progress of headers, files and contours.
+        belongs: selects one of several DICOM labels.
 
     Raises:
         PatientError: not readable, no labels, or all empty.
@@ -44,22 +60,40 @@ def open_labels(path: Path, wanted: Collection[str] = (), progress: Progress = s
     organ_files = sorted(file for file in path.iterdir() if is_volume_file(file)) if path.is_dir() else []
     if organ_files:
         return _file_per_organ(path, organ_files, wanted, progress)
-    found = segmentation_of(read_dicom_headers(path, progress))
+    contents = read_dicom_headers(path, progress)
+    found = segmentation_of(contents, wanted, progress, belongs)
     if found is None:
+        slices = sum(len(series.slices) for series in contents.candidates)
+        a_ct = f", but {slices} CT slices" if slices else ""
+        order = "give the CT first, then the labels" if slices else "choose another"
         raise PatientError(
-            f"{path}: has no labels; expected a DICOM segmentation or structure set, or label maps; choose another"
+            f"{path}: has no labels{a_ct}; expected a DICOM segmentation or structure set, or label maps; {order}"
         )
     return found
 
 
-def segmentation_of(contents: DicomContents) -> Segmentation | None:
-    """The segmentation among DICOM files, or None. Raises PatientError where there are several."""
-    if len(contents.labels) > 1:
-        names = ", ".join(item.name for _, item in contents.labels[:6])
-        raise PatientError(
-            f"{len(contents.labels)} segmentations and structure sets were found: {names}; expected one; give its file as LABELS"
-        )
-    return next((READERS[kind](item) for kind, item in contents.labels), None)
+def segmentation_of(
+    contents: DicomContents,
+    wanted: Collection[str] = (),
+    progress: Progress = silent,
+    belongs: Belongs = lambda references: True,
+) -> Segmentation | None:
+    """The segmentation among DICOM files that belongs to the CT, or None where there is none at all. Raises PatientError."""
+    if len(contents.labels) < 2:
+        return next((READERS[kind](item, wanted, progress) for kind, item in contents.labels), None)
+    headers = [label_header(kind, item) for kind, item in contents.labels]
+    own = [header for header in headers if belongs(header.references)]
+    if len(own) == 1:
+        found = READERS[own[0].kind](own[0].item, wanted, progress)
+        return replace(found, notes=(*found.notes, f"left out, labels of another CT: {len(headers) - 1}"))
+    patients = len({header.references.patient or header.study for header in own})
+    of_patients = f" of {patients} patients" if patients > 1 else ", none of this CT," if not own else ""
+    names = ", ".join(header.item.name for header in (own or headers)[:6])
+    choice = "choose the patient's CT with --series, or " if patients > 1 else ""
+    raise PatientError(
+        f"{len(own or headers)} segmentations and structure sets{of_patients} were found: {names}; expected one; {choice}give its file "
+        "as LABELS"
+    )
 
 
 def _label_map_file(path: Path) -> Segmentation:

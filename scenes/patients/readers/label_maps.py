@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,13 +10,14 @@ import SimpleITK as sitk
 from scipy import ndimage
 
 from errors import PatientError
-from scenes.patients.readers.segment_names import Side, side_of, tissue_of
+from scenes.patients.readers.segment_names import Side, is_needless, side_of, tissue_of
 from scenes.volumes.dicom_references import NO_REFERENCES, DicomReferences
 from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 # Of overlapping segments, later tissues cover earlier ones: small structures cover their surroundings.
 MERGE_ORDER = (None, "fat", "muscle", "bone", "liver", "kidney", "cortex", "medulla", "sinus", "vessel", "vein", "artery", "urine", "cyst", "tumour", "necrosis", "stone")  # fmt: skip
-
+# Of other structures only what is this near to a kidney is read; an import keeps 60 mm around its organ.
+NEAR_MM = 80.0
 
 Colour = tuple[float, float, float]  # red, green, blue, 0 to 1
 
@@ -95,6 +96,18 @@ class Segmentation:
     references: DicomReferences = NO_REFERENCES  # the DICOM objects that they refer to
     grid: VoxelGrid | None = None  # of label maps: all voxels of the first
     empty: tuple[Segment, ...] = ()  # segments that no voxel has
+
+
+def is_left_out(segment: Segment, wanted: Collection[str], is_tissue: bool = True) -> bool:
+    """Whether a segment is not read: it is no tissue, far from the kidneys or the body's outline, and no ``wanted`` name or value."""
+    needless = not is_tissue or is_needless(segment.name)
+    return needless and not any(segment.matches(word) for word in wanted)
+
+
+def note_of_left_out(segments: Sequence[Segment]) -> tuple[str, ...]:
+    """A note that names segments that are not read."""
+    names = listed([str(segment) for segment in segments])
+    return (f"not read, as they are far from the kidneys or no organ: {names}",) * bool(segments)
 
 
 def listed(names: Sequence[str]) -> str:

@@ -30,6 +30,11 @@ FAR = (
     r"vertebrae (c\d|t[1-8]\b)|rib (left|right) [1-7]\b|trachea|o?esophagus|thyroid|prostate|bladder|gluteus|"
     r"brachiocephal|subclavian|carotid|sternum|costal|spinal cord|iliac (artery|vena)"
 )
+# What encloses or carries the patient, and is no organ.
+OUTLINE = (
+    r"^((whole |outer )?body|skin|patient|external|outline|contour)( (contour|outline|surface|skin))?( \d+)?$|couch|"
+    r"\btable ?(top)?$|^mattress"
+)
 SIDE_OF_NAME: tuple[tuple[Side, str], ...] = (
     ("left", r"\b(left|lt|l|links|gauche|sinister|sinistra)\b"),
     ("right", r"\b(right|rt|r|rechts|droite?|dexter|dextra)\b"),
@@ -51,6 +56,11 @@ def is_understood(name: str) -> bool:
 def is_far(name: str) -> bool:
     """Whether a name is of a structure far from the kidneys."""
     return re.search(FAR, _plain(name)) is not None
+
+
+def is_needless(name: str) -> bool:
+    """Whether a name is of a structure that an import does not need: far from the kidneys, the body's outline, a couch."""
+    return is_far(name) or re.search(OUTLINE, _plain(name)) is not None
 
 
 def side_of(name: str) -> Side | None:
