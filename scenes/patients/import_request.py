@@ -9,6 +9,7 @@ import numpy as np
 
 from errors import PatientError
 from scenes.patients.patient_import import Patient, import_patient
+from scenes.patients.patient_position import Position
 from scenes.patients.readers.ct_series import open_ct, read_dicom_headers
 from scenes.patients.readers.label_files import Segmentation, open_labels, segmentation_of
 from scenes.patients.readers.label_maps import assign_tissues, merge_label_maps
@@ -27,6 +28,7 @@ def import_request(
     series: str | None = None,
     seed_mm: np.ndarray | None = None,
     support: str = "mould",
+    position: Position | None = None,
     progress: Progress = silent,
 ) -> tuple[Patient, set[str]]:
     """The imported patient, and the identifiers that none of its files may contain.
@@ -35,7 +37,7 @@ def import_request(
         ct, labels: paths of the user.
         organ: names or values of its labels.
         tissues: tissue -> names or values of its labels.
-        side, support: as in ``import_patient``.
+        side, support, position: as in ``import_patient``.
         series: number or UID of one of several series.
         seed_mm: (3,) LPS; instead of labels.
         progress: shows the progress of each step.
@@ -61,7 +63,14 @@ def import_request(
         merged = draft_segmentation(volume, seed_mm)
     own = merged.values_of(organ) if organ else None
     patient = import_patient(
-        volume, merged, own, side, support=support, needed=set(tissues), progress=progress
+        volume,
+        merged,
+        own,
+        side,
+        support=support,
+        needed=set(tissues),
+        position=position,
+        progress=progress,
     )
     notes = [note for segmentation in segmentations for note in segmentation.notes]
     paths = {str(path.resolve()) for path in (ct, *labels)}

@@ -36,6 +36,7 @@ class LazyVolume:
     metadata: Mapping[str, str] = field(
         default_factory=dict
     )  # of a file's header, with the names of its labels
+    patient_position: str = ""  # DICOM's term, such as HFS, where there is one
 
     @classmethod
     def of(cls, image: sitk.Image, name: str = "the image") -> LazyVolume:

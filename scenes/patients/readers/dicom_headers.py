@@ -29,7 +29,7 @@ TAGS = [
     "ImageType", "FrameOfReferenceUID", "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing",
     "Rows", "Columns", "NumberOfFrames", "RescaleSlope", "RescaleIntercept", "RescaleType",
     "PixelPaddingValue", "PixelPaddingRangeLimit", "BurnedInAnnotation", "SamplesPerPixel",
-    "SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence",
+    "PatientPosition", "SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence",
 ]  # fmt: skip
 MODALITY = re.compile("[A-Z]{2,8}")
 LOCALIZERS = {"LOCALIZER", "SCOUT", "TOPOGRAM"}
@@ -58,6 +58,7 @@ class DicomSlice:
     intercept: float
     is_rescaled: bool  # whether the header has a rescale
     padding: tuple[int, int] | None  # range of raw values outside the field of view
+    patient_position: str = ""  # DICOM's term, such as HFS
 
     @property
     def normal(self) -> np.ndarray:
@@ -200,6 +201,7 @@ def _slice(
         intercept=intercept,
         is_rescaled=value("RescaleIntercept") is not None,
         padding=_padding(header),
+        patient_position=str(value("PatientPosition", "")).strip().upper(),
     )
 
 
