@@ -74,7 +74,7 @@ def patient(ct_and_labels):
 @pytest.fixture
 def without_support(monkeypatch):
     """A mould takes a second, and is tested by itself."""
-    monkeypatch.setattr(scenes.patients.patient_import, "_support", lambda kind, organ, labels, piece: organ)
+    monkeypatch.setattr(scenes.patients.patient_import, "_support", lambda kind, organ, *_: organ)
 
 
 @pytest.fixture
@@ -392,7 +392,9 @@ class TestWarnings:
     """What looks wrong gives warnings, and the import continues."""
 
     def test_a_body_as_it_should_be(self, patient):
-        assert patient.warnings == () and patient.notes == ()
+        assert patient.warnings == ()
+        (note,) = patient.notes
+        assert note.startswith("assumed supine")
 
     def test_turned_over_or_mirrored(self, ct_and_labels):
         ct, labels = ct_and_labels
