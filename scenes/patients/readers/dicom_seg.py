@@ -12,7 +12,7 @@ from scenes.patients.readers.dicom_files import SourceFile
 from scenes.patients.readers.dicom_headers import TAGS, slices_of
 from scenes.patients.readers.identifiers import identifiers_of
 from scenes.patients.readers.label_maps import LabelMap, Segment, Segmentation
-from scenes.patients.readers.segment_names import tissue_of
+from scenes.patients.readers.segment_codes import dicom_meaning
 from scenes.patients.readers.slice_stack import stack_slices
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -61,9 +61,7 @@ def _maps(item: SourceFile, segmentation: hd.seg.Segmentation) -> tuple[list[Lab
         if number == 0:  # background
             continue
         described = segmentation.get_segment_description(number)
-        segment = Segment.named(described.segment_label, int(number))
-        if segment.tissue is None:
-            segment = replace(segment, tissue=tissue_of(described.segmented_property_type.meaning))
+        segment = Segment.coded(item.name, described.segment_label, dicom_meaning(described), int(number))
         grid, inside = read(item, segmentation, int(number))
         if inside.any():
             maps.append(LabelMap.single(grid, inside, segment))

@@ -13,6 +13,7 @@ from scenes.patients.readers.dicom_headers import DicomContents
 from scenes.patients.readers.dicom_seg import read_segmentation
 from scenes.patients.readers.label_maps import LabelMap, Segment, Segmentation, present_values, whole_numbers
 from scenes.patients.readers.rtstruct import read_structures
+from scenes.patients.readers.segment_codes import slicer_meaning
 from scenes.patients.readers.segment_names import is_far, side_of, tissue_of
 from scenes.terminal import Progress, silent
 from scenes.volumes.lazy_volume import LazyVolume
@@ -102,7 +103,8 @@ def _names(volume: LazyVolume) -> dict[tuple[int, int], Segment]:
                     f"{volume.name}: {key} has no whole LabelValue and Layer; export it again from 3D Slicer"
                 )
             colour = (rgb[0], rgb[1], rgb[2]) if len(rgb) == 3 else None
-            found[int(layer), int(label)] = Segment.named(name, int(label), colour)
+            codes = slicer_meaning(volume.metadata.get(f"{start}Tags", ""))
+            found[int(layer), int(label)] = Segment.coded(volume.name, name, codes, int(label), colour)
     return found
 
 
