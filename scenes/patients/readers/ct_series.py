@@ -1,5 +1,6 @@
 """Open a CT: a volume file, or one series of DICOM files."""
 
+import re
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,8 @@ from errors import PatientError
 from scenes.patients.readers.dicom_files import find_dicom_files
 from scenes.patients.readers.dicom_headers import DicomContents, DicomSlice, Series, read_headers
 from scenes.patients.readers.identifiers import identifiers_of
+from scenes.patients.readers.label_maps import listed
+from scenes.patients.readers.segment_names import is_understood
 from scenes.patients.readers.slice_stack import stack_slices
 from scenes.terminal import Progress, silent
 from scenes.volumes.lazy_volume import LazyVolume
@@ -19,6 +22,12 @@ from scenes.volumes.volume_files import ENDINGS, file_volume, is_volume_file
 STRAY = 0.1
 # Characters of a UID that identify a series; series numbers are shorter.
 UID_END = 6
+# In the names of label maps, such as KiTS's segmentation.nii.gz; others are named as a structure.
+LABEL_NAME = re.compile(
+    r"(?i)(?<![a-z])(seg|segmentations?|labels?|labelmap|masks?|annotations?|rois?)(?![a-z])"
+)
+# In the names of CTs that would be structures.
+CT_NAME = re.compile(r"(?i)(?<![a-z])(ct|image|arterial|(portal)?venous)(?![a-z])|phase")
 
 
 def open_ct(
@@ -28,7 +37,7 @@ def open_ct(
 
     Args:
         path: a folder with DICOM files, in subfolders too; a DICOMDIR; a zip archive of DICOM files; an enhanced CT;
-            a .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd file.
+            a .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd file, or a folder with one that is not named as labels.
         series: number or UID (or its end) of one of several series.
         referenced: UID of the series that the labels refer to, which is preferred.
 
@@ -41,18 +50,59 @@ def open_ct(
         if series is not None:
             raise PatientError(f"{path}: has no series; leave --series out")
         return file_volume(path)
-    return _series_volume(path, read_dicom_headers(path, progress), series, referenced, progress)
+    found, volumes = read_dicom_headers(path, progress), _volume_files(path)
+    if volumes and not any(s.slices or s.faults for s in found.series.values()):
+        if series is not None:
+            raise PatientError(f"{path}: has no DICOM series; leave --series out")
+        return _only_volume(path, volumes)
+    stack = _series_volume(path, found, series, referenced, progress)
+    # No names, which may be the patient's.
+    note = f"left out, beside the DICOM files: {len(volumes)} NIfTI, NRRD or MHA files"
+    return replace(stack, notes=(*stack.notes, note)) if volumes else stack
+
+
+def _volume_files(path: Path) -> list[Path]:
+    """The volume files of a folder and its subfolders; none of a file."""
+    entries = path.rglob("*") if path.is_dir() else ()
+    return sorted(file for file in entries if is_volume_file(file) and file.is_file())
+
+
+def _only_volume(folder: Path, files: list[Path]) -> LazyVolume:
+    """The one volume file of a folder that is not named as labels. Raises PatientError where there are several, or labels alone."""
+    images = [file for file in files if not _is_named_as_labels(file)] if len(files) > 1 else files
+    if len(images) != 1:
+        names = listed([str(file.relative_to(folder)) for file in images or files])
+        raise PatientError(
+            f"{folder}: has {len(images) or len(files)} files that may be the CT{'' if images else ', all named as labels'}: {names}; "
+            "expected one; give its path as CT"
+        )
+    volume = file_volume(images[0])
+    chosen = f"of {len(files)} volume files, the one that is not named as labels was taken as the CT"
+    return replace(
+        volume,
+        notes=(*volume.notes, *(chosen,) * (len(files) > 1)),
+        identifiers=volume.identifiers | {str(images[0]), str(images[0].resolve())},
+    )
+
+
+def _is_named_as_labels(file: Path) -> bool:
+    name = file.name.partition(".")[0]
+    if file.name.lower().endswith(".seg.nrrd") or LABEL_NAME.search(name):
+        return True
+    return is_understood(name) and not CT_NAME.search(name)
 
 
 def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
-    """The contents of a folder, DICOMDIR or archive with DICOM files. Raises PatientError where there are none."""
+    """The contents of a folder, DICOMDIR or archive with DICOM files. Raises PatientError where there are neither these nor other
+    volumes.
+    """
     items = find_dicom_files(path)
     if not items and path.is_file():
         raise PatientError(
             f"{path}: unknown kind of file; expected DICOM (a folder, a DICOMDIR or a zip archive), or a file that ends in "
             f"{', '.join(ENDINGS)}; convert it"
         )
-    if not items:
+    if not items and not _volume_files(path):
         raise PatientError(
             f"{path}: no DICOM file found; give the folder of the slices, or a NIfTI, NRRD or MHA file"
         )
