@@ -74,8 +74,8 @@ def import_patient_command(
 
     The folder contains the scene to rehearse.
 
-    CT: a folder with DICOM, a DICOMDIR or zip archive, a NIfTI, NRRD or MHA file. LABELS: label maps, a folder with one
-    file per organ, DICOM-SEG, RTSTRUCT; by default the segmentation in the CT's folder.
+    CT: a folder with DICOM, a DICOMDIR or zip archive, a NIfTI, NRRD or MHA file. LABELS: label maps, surfaces (STL,
+    PLY, OBJ), a folder with one file per organ, DICOM-SEG, RTSTRUCT; by default the segmentation in the CT's folder.
     """
     if lists:
         from scenes.patients.import_listing import listing_text

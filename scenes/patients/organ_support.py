@@ -16,7 +16,7 @@ from skimage.measure import marching_cubes
 from errors import PatientError
 from scenes.patients.label_surfaces import FACES, decimate
 from scenes.patients.readers.label_maps import LabelMap, resample_nearest
-from scenes.surfaces import load_surface, signed_distance_from
+from scenes.surfaces import in_lps, load_surface, signed_distance_from, stated_space
 from scenes.volumes.voxel_grid import VoxelGrid
 
 # Spacing of the sampling grid.
@@ -134,7 +134,7 @@ def bed_of_labels(
 
 
 def bed_of_file(path: Path, organ: trimesh.Trimesh, gravity: np.ndarray) -> trimesh.Trimesh:
-    """A support from a file, LPS [mm].
+    """A support from a file [mm], LPS unless it states RAS.
 
     Args:
         path: of an STL, PLY or OBJ file.
@@ -148,7 +148,7 @@ def bed_of_file(path: Path, organ: trimesh.Trimesh, gravity: np.ndarray) -> trim
         raise PatientError(
             f"{path}: no such file; give a surface for --support: mould, labels, or an STL, PLY or OBJ file"
         )
-    bed = load_surface(path)
+    bed = in_lps(load_surface(path), stated_space(path))
     expected = "in mm and in the CT's coordinates (LPS)"
     gap = least_gap(bed, organ)
     if gap < -MOST_OVERLAP_MM:
