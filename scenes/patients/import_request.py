@@ -16,6 +16,7 @@ from scenes.patients.readers.label_files import Segmentation, open_labels, segme
 from scenes.patients.readers.label_maps import absent_labels, assign_tissues, merge_label_maps
 from scenes.patients.readers.segment_names import Side
 from scenes.patients.readers.series_choice import choose_series
+from scenes.patients.readers.volume_folder import volume_files
 from scenes.patients.region_growing import draft_segmentation
 from scenes.terminal import Progress, silent
 from scenes.volumes.dicom_references import NO_REFERENCES, DicomReferences, doubts, mismatch
@@ -107,7 +108,7 @@ def _segmentations(
     progress: Progress,
 ) -> list[Segmentation]:
     """The segmentations of the paths, else the one among the DICOM files of the CT."""
-    candidates = ct_candidates(ct, contents) if contents else []
+    candidates = [] if contents is None or volume_files(ct) else ct_candidates(ct, contents)
     if series is not None and candidates:
         candidates = [choose_series(ct, candidates, series)[0]]
     own = [one.references for one in candidates]

@@ -102,7 +102,7 @@ def test_a_kidney_and_its_tumour_in_a_folder(tmp_path):
         save_surface(surface, tmp_path / f"{name}.stl")
     (tmp_path / "brain.stl").write_bytes(b"never read")
     found = open_labels(tmp_path)
-    assert found.notes == () and found.identifiers == frozenset()
+    assert found.notes == () and found.identifiers == {}
     maps = found.maps(THICK)
     of = {s.tissue: (one, measured(one)) for one in maps for s in one.segments.values()}
     for tissue, surface in {"kidney": kidney, "tumour": ball(), "vein": vein}.items():
@@ -210,13 +210,15 @@ def test_texts_of_a_header_are_identifiers(tmp_path, name):
     path = written(tmp_path / name, ball(), "SPACE=LPS of Doe^Jane")
     assert any("Doe^Jane" in text for text in open_labels(path).identifiers)
     # What may stand in every patient's files names nobody.
-    assert open_labels(written(tmp_path / name, ball(), "tumour SPACE=LPS")).identifiers == frozenset()
+    assert open_labels(written(tmp_path / name, ball(), "tumour SPACE=LPS")).identifiers == {}
 
 
 def test_a_support_states_its_coordinate_system(tmp_path):
     organ = ball()
-    under = ellipsoid(TUMOUR[0] + [0, 25.0, 0], np.full(3, 12.0))
-    bed = bed_of_file(written(tmp_path / "bed.stl", under, "SPACE=RAS", (-1, -1, 1)), organ)
+    under = ellipsoid(TUMOUR[0] + [0, 31.0, 0], np.array([30.0, 18.0, 30.0]))
+    bed = bed_of_file(
+        written(tmp_path / "bed.stl", under, "SPACE=RAS", (-1, -1, 1)), organ, np.array([0, 1.0, 0])
+    )
     np.testing.assert_allclose(bed.center_mass, under.center_mass, atol=1e-3)
 
 
