@@ -64,7 +64,8 @@ def import_request(
         merged = draft_segmentation(volume, seed_mm)
     own = merged.values_of(organ) if organ else None
     patient = import_patient(volume, merged, own, side, support=support, given=tissues, progress=progress)
-    notes = [note for segmentation in segmentations for note in segmentation.notes]
+    # Several files of one kind have the same note.
+    notes = dict.fromkeys(note for segmentation in segmentations for note in segmentation.notes)
     paths = {str(path.resolve()) for path in (ct, *labels)}
     paths |= {str(path) for path in (ct, *labels) if len(path.parts) > 1}
     identifiers = paths.union(
