@@ -82,7 +82,8 @@ def import_request(
         position=position,
         progress=progress,
     )
-    notes = [note for segmentation in segmentations for note in segmentation.notes]
+    # Several files of one kind have the same note.
+    notes = dict.fromkeys(note for segmentation in segmentations for note in segmentation.notes)
     found = replace(patient, notes=(*patient.notes, *notes, *absent), draft=seed_mm is not None)
     return found, _identifiers((ct, *labels), volume, segmentations)
 
