@@ -14,29 +14,33 @@ from scenes.atomic_files import atomic_write
 # The coordinate system, as 3D Slicer reads it from an STL's header and a PLY's comments.
 SPACE = b"SPACE=LPS"
 STL_HEADER_BYTES = 80
+EXPECTED = "a closed surface in an STL, PLY or OBJ file, in mm, LPS"
 
 
 def load_surface(path: Path) -> trimesh.Trimesh:
     """Read a closed surface that faces outward [mm, LPS]. Raises PatientError."""
     if not path.is_file():
         raise PatientError(f"{path}: no such surface file; give an STL, PLY or OBJ file")
+    if path.stat().st_size == 0:
+        raise PatientError(f"{path}: is empty, 0 bytes; expected {EXPECTED}; copy or export it again")
     try:
+        # A damaged file is taken for other kinds, whose readers raise many kinds of error.
         surface = trimesh.load_mesh(path)
-    except Exception as error:  # trimesh's readers raise many kinds of error
+    except Exception:
         raise PatientError(
-            f"{path}: cannot be read as a surface ({type(error).__name__}); export it as STL"
+            f"{path}: is incomplete or damaged, or of another kind than its name ends in; expected {EXPECTED}; copy or export it again"
         ) from None
-    if (
-        not isinstance(surface, trimesh.Trimesh)
-        or len(surface.faces) == 0
-        or not np.isfinite(surface.vertices).all()
-    ):
+    if not isinstance(surface, trimesh.Trimesh) or len(surface.faces) == 0:
         raise PatientError(
-            f"{path}: has no triangles, or coordinates that are not finite; expected a closed surface in mm, LPS"
+            f"{path}: has no triangles: it is incomplete or damaged, or no surface; expected {EXPECTED}; copy or export it again"
+        )
+    if not np.isfinite(surface.vertices).all():
+        raise PatientError(
+            f"{path}: has coordinates that are not finite; expected {EXPECTED}; export it again"
         )
     if not surface.is_watertight or surface.volume <= 0:
         raise PatientError(
-            f"{path}: is not a closed surface that faces outward; repair it, for example in 3D Slicer"
+            f"{path}: is not a closed surface that faces outward, or is incomplete; copy it again, or repair it, for example in 3D Slicer"
         )
     return surface
 
