@@ -78,15 +78,14 @@ def _decode(item: SourceFile, data: Dataset) -> None:
     syntax = data.file_meta.TransferSyntaxUID
     if not syntax.is_transfer_syntax:
         raise PatientError(f"{_undecoded(item, data)}: an unknown transfer syntax; {UNCOMPRESSED}")
-    is_big, is_bits = not syntax.is_little_endian, data.get("BitsAllocated") == 1
-    if not is_big and not (is_bits and syntax.is_encapsulated and not _decodes(data)):
-        return
     with parsing(_undecoded(item, data), UNCOMPRESSED):
-        if is_big:
+        if not syntax.is_little_endian:
             if data["PixelData"].VR == "OW":
                 data.PixelData = np.frombuffer(data.PixelData, np.uint16).byteswap().tobytes()
-        else:
+        elif syntax.is_encapsulated and data.BitsAllocated == 1 and not _decodes(data):
             data.PixelData = pack_bits(_frames_of_bytes(item, data) > 0)
+        else:
+            return
     data.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
 
 
