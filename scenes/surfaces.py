@@ -20,6 +20,7 @@ Space = Literal["LPS", "RAS"]
 STL_HEADER_BYTES = 80
 ENDINGS = (".stl", ".ply", ".obj")
 MOST_BYTES, MOST_COMMENT_BYTES = 1 << 29, 1 << 16
+EXPECTED = "a closed surface in an STL, PLY or OBJ file, in mm"
 
 
 def is_surface_file(path: Path) -> bool:
@@ -32,7 +33,7 @@ def load_surface(path: Path) -> trimesh.Trimesh:
     surface = read_triangles(path)
     if not surface.is_watertight or surface.volume <= 0:
         raise PatientError(
-            f"{path}: is not a closed surface that faces outward; repair it, for example in 3D Slicer"
+            f"{path}: is not a closed surface that faces outward, or is incomplete; copy it again, or repair it, for example in 3D Slicer"
         )
     return surface
 
@@ -43,21 +44,23 @@ def read_triangles(path: Path) -> trimesh.Trimesh:
         raise PatientError(f"{path}: no such surface file; give an STL, PLY or OBJ file")
     if path.stat().st_size > MOST_BYTES:
         raise PatientError(f"{path}: is larger than {MOST_BYTES >> 20} MiB; reduce its number of triangles")
+    if path.stat().st_size == 0:
+        raise PatientError(f"{path}: is empty, 0 bytes; expected {EXPECTED}; copy or export it again")
     try:
         # From an open file: the path would let an OBJ name files that are then read, such as textures.
         with path.open("rb") as file:
             surface = trimesh.load_mesh(file, file_type=path.suffix[1:].lower(), skip_materials=True)
-    except Exception as error:  # trimesh's readers raise many kinds of error
+    except Exception:  # a damaged file is taken for other kinds, whose readers raise many kinds of error
         raise PatientError(
-            f"{path}: cannot be read as a surface ({type(error).__name__}); export it as STL"
+            f"{path}: is incomplete or damaged, or of another kind than its name ends in; expected {EXPECTED}; copy or export it again"
         ) from None
-    if (
-        not isinstance(surface, trimesh.Trimesh)
-        or len(surface.faces) == 0
-        or not np.isfinite(surface.vertices).all()
-    ):
+    if not isinstance(surface, trimesh.Trimesh) or len(surface.faces) == 0:
         raise PatientError(
-            f"{path}: has no triangles, or coordinates that are not finite; expected a closed surface; export it as STL"
+            f"{path}: has no triangles: it is incomplete or damaged, or no surface; expected {EXPECTED}; copy or export it again"
+        )
+    if not np.isfinite(surface.vertices).all():
+        raise PatientError(
+            f"{path}: has coordinates that are not finite; expected {EXPECTED}; export it again"
         )
     if not surface.is_watertight:
         # A corner with several normals, or places in a texture, is one vertex for each.

@@ -182,6 +182,51 @@ def test_labels_of_another_examination(hospital, tmp_path):
         import_request(tmp_path / "ct")
 
 
+class TestExchanged:
+    """CT and labels in the wrong order, or one for the other: the message gives the right order."""
+
+    @pytest.fixture(scope="class")
+    def paths(self, tmp_path_factory):
+        folder = tmp_path_factory.mktemp("exchanged")
+        series = Series(folder / "ct", DIRECTIONS["identity"])
+        series.write()
+        ones = np.ones(series.size[::-1], np.uint8)
+        write_segmentation(folder / "seg.dcm", series, {"Kidney": ones})
+        write_structures(folder / "rt.dcm", {"Kidney": [series.places(1)[0]]}, series.uid)
+        for name, voxels in (("labels", ones), ("hounsfield", series.hounsfield.astype(np.int16))):
+            sitk.WriteImage(sitk.GetImageFromArray(voxels), str(folder / f"{name}.nii.gz"))
+        return folder
+
+    @pytest.mark.parametrize(
+        ("ct", "labels", "words"),
+        [
+            ("seg.dcm", "ct", "no CT slices, but 1 SEG; expected a CT; give the CT first, then the labels"),
+            (
+                "rt.dcm",
+                "ct",
+                "no CT slices, but 1 RTSTRUCT; expected a CT; give the CT first, then the labels",
+            ),
+            ("rt.dcm", "seg.dcm", "no CT slices, but 1 RTSTRUCT"),
+            ("ct", "ct", "has no labels, but 6 CT slices; .*give the CT first, then the labels"),
+            ("labels.nii.gz", "ct", "has no labels, but 6 CT slices; .*give the CT first, then the labels"),
+            ("labels.nii.gz", "hounsfield.nii.gz", "check that CT and labels are not exchanged"),
+            ("ct", "hounsfield.nii.gz", "check that CT and labels are not exchanged"),
+            ("labels.nii.gz", "labels.nii.gz", "expected HU, .*give the CT first, then the labels"),
+        ],
+    )
+    def test_the_order_is_told(self, paths, ct, labels, words):
+        with pytest.raises(PatientError, match=words):
+            import_request(paths / ct, [paths / labels], side="left")
+
+    @pytest.mark.parametrize("n", [0, 1])
+    def test_a_surface(self, paths, n):
+        (paths / "bed.stl").write_bytes(b"solid")
+        given = [paths / "ct", paths / "seg.dcm"]
+        given[n] = paths / "bed.stl"
+        with pytest.raises(PatientError, match="is a surface; expected a CT or labels in voxels"):
+            import_request(given[0], given[1:])
+
+
 class TestIdentifiers:
     @pytest.fixture
     def patient(self, taken_in):

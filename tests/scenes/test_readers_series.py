@@ -96,6 +96,53 @@ class TestUnevenGaps:
         assert 0.8 * gap < volume.grid.spacing[2] <= gap
 
 
+class TestSpacings:
+    """A series whose spacing changes: no slice is missing, but it is no one volume."""
+
+    def series(self, folder, gaps):
+        at = np.concatenate([[0.0], np.cumsum(gaps)])
+        turned = DIRECTIONS["oblique"]
+        start = np.array([-31.5, 20.25, -400.0])
+        return Series(
+            folder, turned, size=(12, 10, len(at)), positions=lambda k: start + at[k] * turned[:, 2]
+        ).write()
+
+    @pytest.mark.parametrize(
+        ("gaps", "spacings"),
+        [
+            ([5.0] * 6 + [2.5] * 6, ("5.00", "2.50")), ([1.5] * 9 + [5.0] * 4, ("1.50", "5.00")), ([1.5] * 4 + [5.0] * 9, ("1.50", "5.00")),
+            ([2.5] * 6 + [4.0] + [5.0] * 4, ("2.50", "5.00")), ([5.0, 5.0, 5.0, 1.0, 1.0, 1.0, 1.0, 5.0, 5.0, 5.0], ("5.00", "1.00", "5.00")),
+            ([1.3, 1.2, 1.3, 1.2, 5.0, 5.0, 5.0], ("1.25", "5.00")),
+        ],
+    )  # fmt: skip
+    def test_parts_are_named(self, tmp_path, gaps, spacings):
+        message = refusal(self.series(tmp_path, gaps))
+        assert (
+            f"{len(spacings)} parts of different slice spacing" in message
+            and "in a separate folder" in message
+        )
+        parts = message.split("slice spacing: ")[1].split(", then ")
+        assert len(parts) == len(spacings)
+        for part, spacing in zip(parts, spacings, strict=True):
+            assert f"{spacing} mm from slice " in part
+        assert "from slice 1 (s1-0.dcm) at" in parts[0] and f"to slice {len(gaps) + 1} (" in parts[-1]
+
+    @pytest.mark.parametrize(
+        ("gaps", "words"),
+        [
+            ([2.5] * 5 + [5.0] + [2.5] * 5, "no slice to be missing"),
+            ([2.5] * 5 + [5.0, 5.0] + [2.5] * 5, "no slice to be missing"),
+            ([2.5] * 4 + [7.5] + [2.5] * 4 + [5.0] * 4, "no slice to be missing"),
+            ([2.5] * 5 + [1.0, 1.5] + [2.5] * 5, "two acquisitions may overlap"),
+        ],
+    )
+    def test_single_gaps_are_faults(self, tmp_path, gaps, words):
+        assert words in refusal(self.series(tmp_path, gaps))
+
+    def test_a_small_change_is_resampled(self, tmp_path):
+        assert "resampled" in " ".join(read_ct(self.series(tmp_path, [2.5] * 6 + [3.0] * 6))[0].notes)
+
+
 class TestSeries:
     def test_values_beyond_16_bits_are_cut(self, tmp_path):
         series = Series(tmp_path, slope=20.0)

@@ -19,9 +19,13 @@ from synthetic_body import (
     level,
     voxels_to_boundary,
 )
+from trimesh.exchange.ply import export_ply
+from trimesh.exchange.stl import export_stl_ascii
 
+from errors import PatientError
 from scenes.patients.label_surfaces import decimate, self_intersections, surface_from_mask
 from scenes.patients.organ_support import mould
+from scenes.surfaces import load_surface
 
 
 @pytest.fixture
@@ -141,3 +145,30 @@ class TestSupport:
     def test_gravity_without_direction_is_refused(self, gravity):
         with pytest.raises(ValueError, match="gravity"):
             mould(trimesh.creation.icosphere(radius=30), np.array(gravity))
+
+
+@pytest.mark.parametrize("kind", ["stl", "ply", "obj", "ascii.stl", "ascii.ply"])
+@pytest.mark.parametrize("share", [0.0, 0.002, 0.02, 0.3, 0.7, 0.99])
+def test_a_file_that_is_cut_off(tmp_path, kind, share):
+    """In words: what the reader that was tried last misses is no help."""
+    ball, path = trimesh.creation.icosphere(2), tmp_path / f"ball.{kind}"
+    if kind == "ascii.stl":
+        path.write_text(export_stl_ascii(ball))
+    elif kind == "ascii.ply":
+        path.write_bytes(export_ply(ball, encoding="ascii"))
+    else:
+        ball.export(path)
+    assert len(load_surface(path).faces) == len(ball.faces)
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    with pytest.raises(PatientError, match="is empty|incomplete") as caught:
+        load_surface(path)
+    assert "Error" not in str(caught.value) and str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("ending", ["stl", "ply", "obj", "3mf", "dae", "xyz", "txt"])
+@pytest.mark.parametrize("content", [b"Doe^Jane is ill\n" * 40, bytes(500), bytes(range(256)) * 4])
+def test_a_file_of_another_kind(tmp_path, ending, content):
+    (tmp_path / f"a.{ending}").write_bytes(content)
+    with pytest.raises(PatientError, match="expected a closed surface in an STL, PLY or OBJ file") as caught:
+        load_surface(tmp_path / f"a.{ending}")
+    assert "Error" not in str(caught.value) and "Doe" not in str(caught.value)

@@ -30,6 +30,7 @@ from scenes.volumes.voxel_grid import VoxelGrid
 
 # Up to this share of slices in another view are taken for unmarked localizers.
 STRAY = 0.1
+SURFACE_ENDINGS = (".stl", ".ply", ".obj", ".vtk", ".vtp")
 
 
 @dataclass(frozen=True)
@@ -137,6 +138,11 @@ def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
     volumes.
     """
     items = find_dicom_files(path)
+    if not items and path.name.lower().endswith(SURFACE_ENDINGS):
+        raise PatientError(
+            f"{path}: is a surface; expected a CT or labels in voxels; convert it to a segmentation, for example in 3D Slicer, and save "
+            "that as .seg.nrrd"
+        )
     if not items and path.is_file():
         raise PatientError(
             f"{path}: unknown kind of file; expected DICOM (a folder, a DICOMDIR or a zip archive), or a file that ends in "
@@ -152,9 +158,8 @@ def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
 def ct_candidates(path: Path, found: DicomContents) -> list[Series]:
     """All series with CT slices, also damaged ones. Raises PatientError where there are none."""
     if not found.candidates:
-        raise PatientError(
-            f"{path}: {_contents_without_ct(found)}; expected a CT; give the folder of a CT series"
-        )
+        advice = "give the CT first, then the labels" if found.labels else "give the folder of a CT series"
+        raise PatientError(f"{path}: {_contents_without_ct(found)}; expected a CT; {advice}")
     return found.candidates
 
 

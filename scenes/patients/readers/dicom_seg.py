@@ -78,22 +78,26 @@ def _decode(item: SourceFile, data: Dataset) -> None:
     syntax = data.file_meta.TransferSyntaxUID
     if not syntax.is_transfer_syntax:
         raise PatientError(f"{_undecoded(item, data)}: an unknown transfer syntax; {UNCOMPRESSED}")
-    if syntax.is_little_endian and (not syntax.is_compressed or _decodes(data)):
-        return
-    bits = data.get("BitsAllocated")
-    if syntax.is_encapsulated and bits == 1:
-        data.BitsAllocated, data.BitsStored, data.HighBit = 8, 8, 7
     with parsing(_undecoded(item, data), UNCOMPRESSED):
-        size = [int(data.get(name) or 1) for name in ("NumberOfFrames", "Rows", "Columns")]
-        if float(np.prod(np.array(size, float))) > MOST_INFLATED:
-            raise PatientError(f"{item.name}: has more than 2 GiB of frames; {UNCOMPRESSED}")
-        frames = pixel_array(data)
-    if bits == 1:
-        data.PixelData = pack_bits((frames > 0).astype(np.uint8))
-        data.BitsAllocated, data.BitsStored, data.HighBit = 1, 1, 0
-    else:
-        data.PixelData = frames.astype(frames.dtype.newbyteorder("<")).tobytes()
+        if not syntax.is_little_endian:
+            if data["PixelData"].VR == "OW":
+                data.PixelData = np.frombuffer(data.PixelData, np.uint16).byteswap().tobytes()
+        elif syntax.is_encapsulated and data.BitsAllocated == 1 and not _decodes(data):
+            data.PixelData = pack_bits(_frames_of_bytes(item, data) > 0)
+        else:
+            return
     data.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+
+
+def _frames_of_bytes(item: SourceFile, data: Dataset) -> np.ndarray:
+    """The frames (n, rows, columns) of a binary segmentation that is compressed with one byte a pixel."""
+    size = [int(data.get(name) or 1) for name in ("NumberOfFrames", "Rows", "Columns")]
+    if float(np.prod(np.array(size, float))) > MOST_INFLATED:
+        raise PatientError(f"{item.name}: has more than 2 GiB of frames; {UNCOMPRESSED}")
+    data.BitsAllocated, data.BitsStored, data.HighBit = 8, 8, 7
+    frames = pixel_array(data)
+    data.BitsAllocated, data.BitsStored, data.HighBit = 1, 1, 0
+    return frames
 
 
 def _decodes(data: Dataset) -> bool:

@@ -32,7 +32,7 @@ FAR = (
 )
 # What encloses or carries the patient, and is no organ.
 OUTLINE = (
-    r"^((whole |outer )?body|skin|patient|external|outline|contour)( (contour|outline|surface|skin))?( \d+)?$|couch|"
+    r"^(whole |outer )?(body|skin|patient|external|outline|contour)( (contour|outline|surface|skin))?( \d+)?$|couch|"
     r"\btable ?(top)?$|^mattress"
 )
 SIDE_OF_NAME: tuple[tuple[Side, str], ...] = (

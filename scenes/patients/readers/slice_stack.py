@@ -4,6 +4,7 @@ A tilted gantry shears the stack: its slices are shifted within their planes, wi
 """
 
 from collections.abc import Callable, Iterable
+from itertools import pairwise
 
 import numpy as np
 from scipy import ndimage
@@ -24,6 +25,8 @@ OUT_OF_LINE = 1.0
 MOST_TILT = 45.0
 # Spacings, relative to the median, that are resampled; outside this range a slice is missing or duplicated.
 GAPS = (0.5, 1.5)
+# Neighbouring gaps within this ratio are equal, as positions are rounded; so many of them are a part of a series.
+SAME_GAP, PART_FROM_GAPS = 1.25, 3
 PARALLEL = 1e-3
 SAME_PLACE_MM = 1e-3
 MOST_GAP_MM = 10.0
@@ -152,6 +155,18 @@ def _even(
     usual = float(np.percentile(gaps, 50, method="lower"))
     least, most = GAPS
 
+    is_even = least * usual <= gaps.min() and gaps.max() <= most * usual
+    if parts := [] if is_even else _parts_of_one_spacing(gaps):
+        described = ", then ".join(
+            f"{gaps[part].mean():.2f} mm from {slices[part.start].label} at {along[part.start]:.2f} mm to {slices[part.stop].label} at "
+            f"{along[part.stop]:.2f} mm"
+            for part in parts
+        )
+        raise PatientError(
+            f"{name}: the series has {len(parts)} parts of different slice spacing: {described}; expected one spacing; put the slices of "
+            "the part with the organ in a separate folder, or export the series with one spacing"
+        )
+
     def pair(n: int) -> str:
         (a, b), (at_a, at_b) = slices[n : n + 2], along[n : n + 2]
         return f"{a.label} at {at_a:.2f} mm and {b.label} at {at_b:.2f} mm are {gaps[n]:.2f} mm apart, the others {usual:.2f} mm"
@@ -199,6 +214,20 @@ def _finest_planes(along: np.ndarray) -> tuple[np.ndarray, float]:
         worst.append((off * gap, gap))
     gap = min(worst)[1]
     return along / gap, float(gap)
+
+
+def _parts_of_one_spacing(gaps: np.ndarray) -> list[slice]:
+    """The parts (of ``gaps``) of a series whose spacing changes from one to another; [] where single slices are missing or too many."""
+    change = 1 + np.flatnonzero(np.maximum(gaps[1:], gaps[:-1]) > SAME_GAP * np.minimum(gaps[1:], gaps[:-1]))
+    runs = [slice(a, b) for a, b in pairwise([0, *change.tolist(), len(gaps)])]
+    parts = [run for run in runs if run.stop - run.start >= PART_FROM_GAPS]
+    means = np.array([gaps[part].mean() for part in parts])
+    # Between two parts one gap may be of neither.
+    between = len(gaps) - sum(part.stop - part.start for part in parts)
+    if len(parts) < 2 or between > len(parts) - 1:
+        return []
+    changes = np.maximum(means[1:], means[:-1]) / np.minimum(means[1:], means[:-1])
+    return parts if changes.min() > GAPS[1] else []
 
 
 def _straightened(
