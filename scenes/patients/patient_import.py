@@ -14,6 +14,7 @@ import trimesh
 
 from errors import PatientError
 from scenes.patients.import_warnings import fat_warnings, label_warnings, orientation_warnings, stone_warnings
+from scenes.patients.kidney_plausibility import kidney_warnings
 from scenes.patients.organ_selection import (
     HILAR,
     LESIONS,
@@ -133,6 +134,7 @@ def import_patient(
     with part_surfaces_in_processes(found) as parts_made:
         surface = organ_surface(piece)
         _check_surface(surface, piece)
+        warnings += kidney_warnings(piece, labels, surface, actual_side, midline)
         bed = _support(support, surface, labels, piece, actual_position)
         parts = parts_made(progress)
     volumes = {part: float(inside.sum() * part_grid.voxel_ml) for part, (part_grid, inside) in found.items()}

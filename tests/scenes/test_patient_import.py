@@ -429,6 +429,17 @@ class TestWarnings:
         ml = stone.sum() * np.prod(ct.GetSpacing()) / 1000
         assert f"{ml:.1f} ml inside the organ are as bright as stone" in warning and "--collecting" in warning
 
+    def test_a_label_that_is_no_whole_kidney(self, ct_and_labels):
+        """Hollow, and cut off above."""
+        ct, labels = ct_and_labels
+        points, marks = points_of(ct), sitk.GetArrayFromImage(labels)
+        marks[(level(points, (LEFT[0], LEFT[1] - [9, 9, 18])) < 0) | (points[..., 2] > LEFT[0][2] + 30)] = 0
+        small, hollow, flat = imported(
+            ct, with_voxels(labels, marks), [2], margin_mm=20.0, tumour=[3]
+        ).warnings
+        assert "the kidney is small" in small and "label is hollow: it has" in hollow
+        assert "towards the head in a flat face" in flat
+
     def test_labels_without_a_meaning(self, ct_and_labels):
         (warning,) = imported(*ct_and_labels, side="left", margin_mm=20.0).warnings
         assert "labels 2, 3 have no names, and were all taken as the kidney" in warning
