@@ -15,6 +15,7 @@ import trimesh
 from errors import PatientError
 from scenes.patients.import_warnings import fat_warnings, label_warnings, orientation_warnings, stone_warnings
 from scenes.patients.kidney_plausibility import kidney_warnings
+from scenes.patients.label_shift import shift_warnings
 from scenes.patients.organ_selection import (
     HILAR,
     LESIONS,
@@ -125,7 +126,11 @@ def import_patient(
     warnings = (
         *position_warnings(overview, actual_position),
         *orientation_warnings(level, level_hu, labels, midline),
-        *fat_warnings(grid, hounsfield, on_ct, of("kidney")),
+        # Fat in the rim of a label that is shifted by a few millimetres has the same cause.
+        *(
+            shift_warnings(grid, hounsfield, piece.grid, piece.mask)
+            or fat_warnings(grid, hounsfield, on_ct, of("kidney"))
+        ),
         *stone_warnings(grid, hounsfield, of("kidney", "cortex", "medulla", "sinus"), of("urine")),
         *label_warnings(labels, piece, organ is not None),
     )
