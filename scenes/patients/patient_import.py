@@ -117,21 +117,12 @@ def import_patient(
     on_ct = resample_nearest(piece.grid, piece.mask, grid)
     _check_place(ct.grid, grid, on_ct, hounsfield, piece)
     coded, tissues = _tissue_labels(labels, grid, on_ct)
-
-    def of(*wanted: str) -> np.ndarray:
-        return np.isin(coded, [code for code, tissue in tissues.items() if tissue in wanted])
-
     actual_position, position_notes = position_of(ct.patient_position, position)
     overview = _overview(level, level_hu)
     warnings = (
         *position_warnings(overview, actual_position),
         *orientation_warnings(level, level_hu, labels, midline),
-        # Fat in the rim of a label that is shifted by a few millimetres has the same cause.
-        *(
-            shift_warnings(grid, hounsfield, piece.grid, piece.mask)
-            or fat_warnings(grid, hounsfield, on_ct, of("kidney"))
-        ),
-        *stone_warnings(grid, hounsfield, of("kidney", "cortex", "medulla", "sinus"), of("urine")),
+        *_tissue_warnings(piece, grid, hounsfield, on_ct, coded, tissues),
         *label_warnings(labels, piece, organ is not None),
     )
     found = part_masks(labels, piece)
@@ -160,6 +151,27 @@ def import_patient(
         colours=colours_of_labels(labels, [*parts]),
         position=actual_position,
     )
+
+
+def _tissue_warnings(
+    piece: Organ,
+    grid: VoxelGrid,
+    hounsfield: np.ndarray,
+    on_ct: np.ndarray,
+    coded: np.ndarray,
+    tissues: dict[int, str],
+) -> tuple[str, ...]:
+    """Warnings of what the CT shows in and around the organ; ``on_ct`` and ``coded`` are on its grid."""
+
+    def of(*wanted: str) -> np.ndarray:
+        return np.isin(coded, [code for code, tissue in tissues.items() if tissue in wanted])
+
+    # Fat in the rim of a label that is shifted by a few millimetres has the same cause.
+    misplaced = shift_warnings(grid, hounsfield, piece.grid, piece.mask) or fat_warnings(
+        grid, hounsfield, on_ct, of("kidney")
+    )
+    solid = of("kidney", "cortex", "medulla", "sinus")
+    return (*misplaced, *stone_warnings(grid, hounsfield, solid, of("urine")))
 
 
 def _support(
