@@ -55,7 +55,7 @@ COMMANDS = {
     "scan": ("rehearsal.commands.scan_command:scan", "Make images of SCENE at a list of probe poses."),
     "reconstruct": (
         "rehearsal.commands.reconstruct_command:reconstruct",
-        "Reconstruct a volume from SWEEP, a tracked sweep (.igs.mha).",
+        "Reconstruct a volume from SWEEP, a tracked sweep (.igs.mha, .igs.nrrd).",
     ),
     "validate": (
         "studies.accuracy.accuracy_commands:validate",

@@ -93,7 +93,11 @@ class Frames(Generic[Source]):
         """Compute the images of the probe at its present pose."""
         time_s = self.source.session.time_s
         view = image_view(self.rehearsal, probe, settings, self.tally, None, time_s)
-        return replace(self.with_resection(view, settings), warnings=self.warnings)
+        return replace(self.with_resection(view, settings), warnings=self.import_warnings())
+
+    def import_warnings(self) -> tuple[str, ...]:
+        """The warnings of the import, as the 3D view shows them."""
+        return tuple(f"Import: {text}" for text in self.warnings)
 
     def with_resection(self, view: View, settings: Settings) -> View:
         """A view with the score and the coming cut."""
@@ -300,17 +304,17 @@ class WindowFrames(Frames[WindowInput]):
             caliper_mm=self.caliper.points,
             caliper=self.caliper.figure(shown),
             readouts=view.readouts | self._speeds(),
-            warnings=tuple(map(self.keys.worded, self._warnings())),
+            warnings=self.import_warnings(),
             clock=f"{self.source.session.time_s:.1f} s",
             pace=self._pace(),
             status=self._status(view, controls.settings),
             notes={name: self._with_hint(note) for name, note in view.notes.items()},
         )
 
-    def _warnings(self) -> tuple[str, ...]:
+    def import_warnings(self) -> tuple[str, ...]:
         """The warnings of the import, and the key that acknowledges them."""
-        first = tuple(f"Import: {text}" for text in self.warnings)
-        return (*first, HOW_TO_ACKNOWLEDGE) if first else ()
+        shown = super().import_warnings()
+        return (*shown, self.keys.worded(HOW_TO_ACKNOWLEDGE)) if shown else ()
 
     def _record_sweep(self, probe: Probe, view: View, controls: Controls) -> None:
         if not self.frozen:

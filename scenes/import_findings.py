@@ -44,6 +44,8 @@ class ImportFindings(Section):
     version: str
     side: Literal["left", "right"]
     draft: bool
+    position: Literal["supine", "prone", "left-decubitus", "right-decubitus"]
+    """How the patient lay in the CT."""
     extent_mm: Vector3
     """Of the organ: right-left, front-back, foot-head."""
     surfaces: dict[str, SurfaceFindings]

@@ -260,7 +260,7 @@ class Scene(Section):
 
 # Files that are given by mistake instead of a scene, by the end of their names, and the commands that read them.
 NOT_SCENES: dict[str | tuple[str, ...], str] = {
-    ".igs.mha": "a tracked sweep: give it to app.py reconstruct or rehearse --track",
+    (".igs.mha", ".igs.nrrd"): "a tracked sweep: give it to app.py reconstruct or rehearse --track",
     (
         ".dcm",
         ".nii",

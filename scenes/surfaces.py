@@ -1,6 +1,8 @@
 """Closed surfaces in LPS [mm]: read and written as files, translated; the volume inside one, and distances from it."""
 
+import re
 from pathlib import Path
+from typing import Literal, cast
 
 import igl
 import numpy as np
@@ -13,20 +15,42 @@ from scenes.atomic_files import atomic_write
 
 # The coordinate system, as 3D Slicer reads it from an STL's header and a PLY's comments.
 SPACE = b"SPACE=LPS"
+SPACE_FIELD = re.compile(r"\bSPACE ?= ?([\w-]+)")
+Space = Literal["LPS", "RAS"]
 STL_HEADER_BYTES = 80
-EXPECTED = "a closed surface in an STL, PLY or OBJ file, in mm, LPS"
+ENDINGS = (".stl", ".ply", ".obj")
+MOST_BYTES, MOST_COMMENT_BYTES = 1 << 29, 1 << 16
+EXPECTED = "a closed surface in an STL, PLY or OBJ file, in mm"
+
+
+def is_surface_file(path: Path) -> bool:
+    """Whether a file name ends like that of a surface."""
+    return path.suffix.lower() in ENDINGS
 
 
 def load_surface(path: Path) -> trimesh.Trimesh:
-    """Read a closed surface that faces outward [mm, LPS]. Raises PatientError."""
+    """Read a closed surface that faces outward, in the coordinates of its file [mm]. Raises PatientError."""
+    surface = read_triangles(path)
+    if not surface.is_watertight or surface.volume <= 0:
+        raise PatientError(
+            f"{path}: is not a closed surface that faces outward, or is incomplete; copy it again, or repair it, for example in 3D Slicer"
+        )
+    return surface
+
+
+def read_triangles(path: Path) -> trimesh.Trimesh:
+    """Read a surface, closed or not, in the coordinates of its file. Raises PatientError."""
     if not path.is_file():
         raise PatientError(f"{path}: no such surface file; give an STL, PLY or OBJ file")
+    if path.stat().st_size > MOST_BYTES:
+        raise PatientError(f"{path}: is larger than {MOST_BYTES >> 20} MiB; reduce its number of triangles")
     if path.stat().st_size == 0:
         raise PatientError(f"{path}: is empty, 0 bytes; expected {EXPECTED}; copy or export it again")
     try:
-        # A damaged file is taken for other kinds, whose readers raise many kinds of error.
-        surface = trimesh.load_mesh(path)
-    except Exception:
+        # From an open file: the path would let an OBJ name files that are then read, such as textures.
+        with path.open("rb") as file:
+            surface = trimesh.load_mesh(file, file_type=path.suffix[1:].lower(), skip_materials=True)
+    except Exception:  # a damaged file is taken for other kinds, whose readers raise many kinds of error
         raise PatientError(
             f"{path}: is incomplete or damaged, or of another kind than its name ends in; expected {EXPECTED}; copy or export it again"
         ) from None
@@ -38,11 +62,42 @@ def load_surface(path: Path) -> trimesh.Trimesh:
         raise PatientError(
             f"{path}: has coordinates that are not finite; expected {EXPECTED}; export it again"
         )
-    if not surface.is_watertight or surface.volume <= 0:
-        raise PatientError(
-            f"{path}: is not a closed surface that faces outward, or is incomplete; copy it again, or repair it, for example in 3D Slicer"
-        )
+    if not surface.is_watertight:
+        # A corner with several normals, or places in a texture, is one vertex for each.
+        surface.merge_vertices(merge_tex=True, merge_norm=True)
     return surface
+
+
+def file_comments(path: Path) -> list[str]:
+    """The texts in a surface file that are no geometry: the header of an STL, the comments of a PLY or OBJ."""
+    with path.open("rb") as file:
+        start = file.read(MOST_COMMENT_BYTES)
+    kind = path.suffix.lower()
+    if kind == ".ply":
+        start = start.partition(b"end_header")[0]
+    elif kind == ".stl":
+        is_text = start.startswith(b"solid") and b"facet" in start
+        start = start.partition(b"\n")[0].removeprefix(b"solid") if is_text else start[:STL_HEADER_BYTES]
+        return re.findall(r"[^\W_][ -~\xa1-\xff]{2,}", start.decode("latin-1"))
+    marks = {".ply": ("comment ", "obj_info "), ".obj": ("#",)}.get(kind, ())
+    lines = start.decode("latin-1").splitlines()
+    return [line.removeprefix(mark).strip() for line in lines for mark in marks if line.startswith(mark)]
+
+
+def stated_space(path: Path) -> Space | None:
+    """The coordinate system that a surface file states as 3D Slicer does, or None. Raises PatientError: two, or another."""
+    found = {name for text in file_comments(path) for name in SPACE_FIELD.findall(text)}
+    if len(found) > 1 or not found <= {"LPS", "RAS"}:
+        raise PatientError(
+            f"{path}: states SPACE={' and SPACE='.join(sorted(found))}; expected LPS or RAS; export it again from 3D Slicer"
+        )
+    return cast(Space, found.pop()) if found else None
+
+
+def in_lps(surface: trimesh.Trimesh, space: Space | None) -> trimesh.Trimesh:
+    """A surface of a coordinate system, None for LPS, in LPS; the order of vertices and faces stays."""
+    turn = (-1.0, -1.0, 1.0) if space == "RAS" else (1.0, 1.0, 1.0)
+    return trimesh.Trimesh(surface.vertices * turn, surface.faces, process=False)
 
 
 def save_surface(surface: trimesh.Trimesh, path: Path) -> None:

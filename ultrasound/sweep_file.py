@@ -1,7 +1,6 @@
-"""Sweeps as IGSIO sequence metafiles (.igs.mha) of PLUS and 3D Slicer: a MetaImage whose header has poses and times."""
+"""Sweeps as sequence files of PLUS: metafiles (.igs.mha), also of 3D Slicer, a MetaImage whose header has poses and times; and NRRD."""
 
 import os
-import re
 import reprlib
 import secrets
 import shutil
@@ -12,15 +11,24 @@ from typing import BinaryIO
 
 import numpy as np
 
+from ultrasound.nrrd_sweep import MAGIC, nrrd_frame_lines, nrrd_header, read_nrrd
 from ultrasound.probe import Probe
+from ultrasound.sequence_fields import (
+    HEADER_LIMIT,
+    PIXEL_LIMIT,
+    FrameFields,
+    accept,
+    field_line,
+    in_order,
+    numbers_of,
+    put_field,
+)
 from ultrasound.sweep import ORIENTATIONS, Sweep, SweepError, reoriented, transform_fields
 from version import VERSION
 
-HEADER_LIMIT = 64 << 20
 # A higher level compresses speckle no better, and a sweep is written while it is recorded.
 COMPRESSION_LEVEL = 1
-PIXEL_LIMIT = (1 << 32) - 1  # PLUS counts a sweep's bytes in 32 bits.
-FRAME_FIELD = re.compile(r"Seq_Frame([0-9]{4,9})_(.+)", re.DOTALL)
+GZIP, ZLIB = 31, 15  # zlib's wbits of NRRD and of a metafile
 # Accepted values of a sweep with pixels; the first is the default where the field is not required.
 PIXEL_FORMAT = {
     "NDims": ("3",),
@@ -56,13 +64,20 @@ NO_PIXELS = {
     "UltrasoundImageOrientation": "XX",
     "UltrasoundImageType": "XX",
 }
+# Fields of a metafile that are its format's; NRRD has its own.
+METAFILE_FIELDS = NEW_HEADER.keys() - {"UltrasoundImageOrientation", "UltrasoundImageType"} | {
+    "ElementByteOrderMSB",
+    "ElementNumberOfChannels",
+    "HeaderSize",
+}
 SUFFIX, LABELS_SUFFIX = ".igs.mha", "-marks.igs.mha"
+NRRD_SUFFIX = ".igs.nrrd"
 # Fields of the header: the probe, and the version of Nephron.
 PROBE_FIELD, VERSION_FIELD = "TransducerName", "NephronVersion"
 
 
 def read_sweep(path: Path) -> Sweep:
-    """Return a sequence metafile's images, in MF, and fields. Times and transforms are parsed on demand.
+    """Return a sequence file's images, in MF, and fields, with the names of a metafile. Times and transforms are parsed on demand.
 
     Raises SweepError with the file's name for a file that cannot be read, is damaged, or is not an 8-bit B-mode sweep.
     """
@@ -74,7 +89,8 @@ def read_sweep(path: Path) -> Sweep:
 
 
 def write_sweep(path: Path, sweep: Sweep) -> None:
-    """Write a sweep; a sweep that was read keeps the lines of its header. The same sweep gives the same bytes.
+    """Write a sweep, as NRRD where the name ends in .nrrd, else as a metafile; a sweep that was read from one keeps the lines of its
+    header. The same sweep gives the same bytes.
 
     Raises SweepError for a sweep that does not fit into a file, and OSError; an existing file is then not changed.
     """
@@ -85,22 +101,30 @@ def write_sweep(path: Path, sweep: Sweep) -> None:
 
 def read_ground_truth(sweep: Path) -> Sweep | None:
     """Return the labels recorded with a sweep, None where there are none. Raises SweepError."""
-    path = sweep.with_name(sweep.name.removesuffix(SUFFIX) + LABELS_SUFFIX)
-    return read_sweep(path) if sweep.name.endswith(SUFFIX) and path != sweep and path.is_file() else None
+    suffix = suffix_of(sweep)
+    path = sweep.with_name(sweep.name.removesuffix(suffix) + LABELS_SUFFIX.removesuffix(SUFFIX) + suffix)
+    return read_sweep(path) if sweep.name.endswith(suffix) and path.is_file() else None
+
+
+def suffix_of(sweep: Path) -> str:
+    """How the names of sweeps in the format of this one end."""
+    return NRRD_SUFFIX if sweep.suffix.lower() == ".nrrd" else SUFFIX
 
 
 class SweepWriter:
     """Writes a sweep frame by frame, pixels to disk; ``close`` writes the file atomically. ``count`` is the number of frames so far.
 
-    ``fields`` add to PLUS's own, or replace them where they are those of a sweep that was read. As a context manager it closes at the
-    end, and leaves no file after an exception.
+    The format is that of the name: NRRD (.nrrd), else a metafile. ``fields`` add to PLUS's own, or replace them where they are those
+    of a sweep that was read. As a context manager it closes at the end, and leaves no file after an exception.
     """
 
     def __init__(self, path: Path, fields: dict[str, str]) -> None:
         self.path, self.count = path, 0
+        self._is_nrrd = suffix_of(path) == NRRD_SUFFIX
         self._header = dict(fields) if "ObjectType" in fields else NEW_HEADER | fields
         self._shape: tuple[int, ...] = ()
-        self._lines, self._compress = bytearray(), zlib.compressobj(COMPRESSION_LEVEL)
+        wbits = GZIP if self._is_nrrd else ZLIB
+        self._lines, self._compress = bytearray(), zlib.compressobj(COMPRESSION_LEVEL, wbits=wbits)
         # Deleted by the system, even if the process is killed.
         self._pixels = tempfile.TemporaryFile(dir=path.parent)
 
@@ -122,7 +146,7 @@ class SweepWriter:
             raise SweepError(f"frame {self.count}: image of {found}: expected uint8 {expected}")
         if (self.count + 1) * image.size > PIXEL_LIMIT:
             raise SweepError(f"frame {self.count}: more than {PIXEL_LIMIT} bytes of pixels")
-        lines = b"".join(_line(f"Seq_Frame{self.count:04}_{name}", text) for name, text in fields.items())
+        lines = (nrrd_frame_lines if self._is_nrrd else _frame_lines)(self.count, fields)
         self._shape, self.count = image.shape, self.count + 1
         self._lines += lines
         if image.size:
@@ -135,10 +159,11 @@ class SweepWriter:
         with self._pixels:
             if not self.count:
                 raise SweepError("a sweep without frames")
-            if any(self._shape):
+            if self._is_nrrd and not any(self._shape):
+                self._pixels.write(self._compress.compress(bytes(self.count)))
+            if self._is_nrrd or any(self._shape):
                 self._pixels.write(self._compress.flush())
-            header = b"".join(_line(*each) for each in self._final_header().items())
-            header += self._lines + b"ElementDataFile = LOCAL\n"
+            header = self._nrrd_header() if self._is_nrrd else self._metafile_header()
             if len(header) > HEADER_LIMIT:
                 raise SweepError(f"a header of {len(header)} bytes: at most {HEADER_LIMIT} can be read again")
             partial = self.path.with_name(f".{self.path.name}.partial-{secrets.token_hex(4)}")
@@ -151,7 +176,17 @@ class SweepWriter:
             finally:
                 partial.unlink(missing_ok=True)
 
-    def _final_header(self) -> dict[str, str]:
+    def _nrrd_header(self) -> bytes:
+        rows, columns = self._shape
+        own = {name: text for name, text in self._fields().items() if name not in METAFILE_FIELDS}
+        return nrrd_header(own, (rows, columns), self.count) + self._lines + b"\n"
+
+    def _metafile_header(self) -> bytes:
+        lines = b"".join(field_line(name, " = ", text) for name, text in self._fields().items())
+        return lines + self._lines + b"ElementDataFile = LOCAL\n"
+
+    def _fields(self) -> dict[str, str]:
+        """The fields of the header, with the names of a metafile."""
         rows, columns = self._shape
         header = dict(self._header)
         size = f"{columns} {rows} {self.count}"
@@ -211,28 +246,22 @@ class LabelledSweep:
             raise
 
 
-def _line(name: str, text: str) -> bytes:
-    if "=" in name or name != name.strip() or not name or "\n" in name + text:
-        raise SweepError(f"field {reprlib.repr(name + ' = ' + text)}: expected one line, no = in the name")
-    try:
-        return f"{name} = {text}\n".encode("latin-1")
-    except UnicodeEncodeError as error:
-        raise SweepError(f"field {reprlib.repr(name)}: a character beyond Latin-1") from error
+def _frame_lines(number: int, fields: dict[str, str]) -> bytes:
+    return b"".join(field_line(f"Seq_Frame{number:04}_{name}", " = ", text) for name, text in fields.items())
 
 
 def _read(file: BinaryIO) -> Sweep:
+    is_nrrd = file.read(len(MAGIC)) == MAGIC
+    file.seek(0)
+    if is_nrrd:
+        return read_nrrd(file)
     fields, numbered = _read_header(file)
-    columns, rows, count = _dimensions(fields)
-    last = max(numbered, default=-1)
-    if len(numbered) != count or last != count - 1:
-        raise SweepError(f"DimSize has {count} frames, but {len(numbered)} have fields, the last is {last}")
-    frames = [numbered[each] for each in range(count)]
+    columns, rows, count = numbers_of("DimSize", fields.get("DimSize", ""), "columns rows frames")
+    frames = in_order(numbered, count, "DimSize")
     if columns * rows == 0:
         return Sweep(np.empty((count, 0, 0), np.uint8), frames, fields)
     for name, accepted in PIXEL_FORMAT.items():
-        text = fields.get(name, "" if name in REQUIRED else accepted[0])
-        if " ".join(text.split()) not in accepted:
-            raise SweepError(f"{name} = {reprlib.repr(text)}: expected {' or '.join(accepted)}")
+        accept(name, fields.get(name, "" if name in REQUIRED else accepted[0]), accepted)
     orientation = fields["UltrasoundImageOrientation"].strip()
     pixels = np.frombuffer(_read_pixels(file, fields, columns * rows * count), np.uint8)
     if ORIENTATIONS[orientation] != "MF":
@@ -240,13 +269,13 @@ def _read(file: BinaryIO) -> Sweep:
     return Sweep(reoriented(pixels.reshape(count, rows, columns), orientation), frames, fields)
 
 
-def _read_header(file: BinaryIO) -> tuple[dict[str, str], dict[int, dict[str, str]]]:
+def _read_header(file: BinaryIO) -> tuple[dict[str, str], FrameFields]:
     """Return the fields of the header and of each frame by number; leave the file at the pixels."""
     fields: dict[str, str] = {}
-    frames: dict[int, dict[str, str]] = {}
+    frames: FrameFields = {}
     if b"".join(file.readline(HEADER_LIMIT).split()) != b"ObjectType=Image":
         raise SweepError(
-            "is not a sweep; expected a tracked one (.igs.mha), which begins with ObjectType = Image"
+            "is not a sweep; expected a tracked one (.igs.mha, .igs.nrrd), which begins with ObjectType = Image or NRRD"
         )
     file.seek(0)
     while True:
@@ -262,23 +291,7 @@ def _read_header(file: BinaryIO) -> tuple[dict[str, str], dict[int, dict[str, st
             if text.strip() != "LOCAL":
                 raise SweepError(f"ElementDataFile = {reprlib.repr(text)}: expected LOCAL")
             return fields, frames
-        match = FRAME_FIELD.fullmatch(name)
-        if name.startswith("Seq_Frame") and not match:
-            raise SweepError(f"field {reprlib.repr(name)}: expected Seq_Frame0000_Name")
-        into, key = (frames.setdefault(int(match[1]), {}), match[2]) if match else (fields, name)
-        if key in into:
-            raise SweepError(f"field {reprlib.repr(name)}: found twice")
-        into[key] = text
-
-
-def _dimensions(fields: dict[str, str]) -> tuple[int, int, int]:
-    text = fields.get("DimSize", "")
-    if not re.fullmatch(r"\s*[0-9]{1,9}\s+[0-9]{1,9}\s+[0-9]{1,9}\s*", text):
-        raise SweepError(f"DimSize = {reprlib.repr(text)}: expected columns rows frames")
-    columns, rows, count = map(int, text.split())
-    if not count or columns * rows * count > PIXEL_LIMIT:
-        raise SweepError(f"DimSize = {reprlib.repr(text)}: expected 1 frame to {PIXEL_LIMIT} bytes of them")
-    return columns, rows, count
+        put_field(name, text, fields, frames)
 
 
 def _read_pixels(file: BinaryIO, fields: dict[str, str], size: int) -> bytes:

@@ -34,7 +34,7 @@ from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
 from ultrasound.reconstruction import METHODS
 from ultrasound.sweep import Sweep, load_constants
-from ultrasound.sweep_file import PROBE_FIELD, read_ground_truth, read_sweep, write_sweep
+from ultrasound.sweep_file import PROBE_FIELD, read_ground_truth, read_sweep, suffix_of, write_sweep
 from ultrasound.tracking_errors import TrackingErrors
 from version import VERSION
 
@@ -81,11 +81,11 @@ class ReconstructOptions(ArchOptions):
 
 @command(ReconstructOptions)
 def reconstruct(asked: ReconstructOptions) -> None:
-    """Reconstruct a volume from SWEEP, a tracked sweep (.igs.mha).
+    """Reconstruct a volume from SWEEP, a tracked sweep (.igs.mha, .igs.nrrd).
 
     The sweep is from Nephron or PLUS. Writes volume.nrrd, volume.png and report.json; with ground-truth labels
     (SWEEP-marks.igs.mha, which a rehearsal records) also organ and tumour in labels.nrrd. With simulated tracker
-    errors, it also writes the sweep that has them, tracked.igs.mha.
+    errors, it also writes the sweep that has them, tracked.igs.mha, or .igs.nrrd as the sweep.
     """
     out, reference = asked.out, asked.reference
     if asked.undo_compression and asked.scene is None:
@@ -101,7 +101,7 @@ def reconstruct(asked: ReconstructOptions) -> None:
     patient = None if asked.scene is None else load_patient(asked.scene)
     make_folder(out)
     if errors != TrackingErrors():
-        write_sweep(out / "tracked.igs.mha", images)
+        write_sweep(out / f"tracked{suffix_of(asked.sweep)}", images)
     settings: dict[str, Any] = dict(
         method=asked.method,
         spacing_mm=asked.spacing_mm,

@@ -68,7 +68,7 @@ class RehearseOptions(LinkOptions, ImageOptions, QualityOptions, ArchOptions):
     at: float = Field(0.0, ge=0)
     """With --replay: start at this second."""
     track: Path | None = None
-    """Recorded poses that move the probe: a tracked sweep (.igs.mha), or poses with times (CSV, JSON)."""
+    """Recorded poses that move the probe: a tracked sweep (.igs.mha, .igs.nrrd), or poses with times (CSV, JSON)."""
     track_from: str | None = None
     """With --track: the sweep's transform from probe to patient [ProbeToReference]."""
     rate: float | None = Field(None, ge=15, le=1000)

@@ -16,16 +16,16 @@ FAR_MM = 50.0
 
 
 def load_track(path: Path, name: str | None = None) -> TimedPoses:
-    """The poses of a probe in the patient, from a tracked sweep (.igs.mha), the first sweep of a plan, or a pose file with times.
+    """The poses of a probe in the patient, from a tracked sweep (.igs.mha, .igs.nrrd), the first sweep of a plan, or a pose file with times.
 
     ``name`` is the sweep's transform from the probe to the patient, ProbeToReference where it is None. Raises PoseError, SweepError,
     PlanError.
     """
-    if path.suffix.lower() == ".mha":
+    if path.suffix.lower() in (".mha", ".nrrd"):
         return _sweep_poses(path, name or PROBE_IN_PATIENT)
     if name is not None:
         raise PoseError(
-            f"--track-from {name}: names a transform of a sweep, and {path.name} is not a sweep (.igs.mha); leave it out"
+            f"--track-from {name}: names a transform of a sweep, and {path.name} is not a sweep (.igs.mha, .igs.nrrd); leave it out"
         )
     if is_plan(path):
         plan = read_plan(path)

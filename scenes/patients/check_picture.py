@@ -21,6 +21,7 @@ from scenes.patients.organ_selection import HILAR
 from scenes.patients.part_surfaces import PARTS, PEDICLE_MM
 from scenes.patients.patient_complexity import complexity_of_patient
 from scenes.patients.patient_import import Patient
+from scenes.patients.patient_position import LYING
 from scenes.patients.readers.label_maps import Colour
 from scenes.volumes.lazy_volume import AIR_HU
 from scenes.volumes.voxel_grid import VoxelGrid
@@ -103,7 +104,7 @@ def summary_rows(patient: Patient) -> list[tuple[str, str]]:
             rows.append((word, "none labelled as one"))
     found = complexity_of_patient(patient)
     rows += [] if found is None else found.rows()
-    rows.append(("support", f"{len(patient.support.faces)} faces, for a patient lying supine"))
+    rows.append(("support", f"{len(patient.support.faces)} faces, for a patient {LYING[patient.position]}"))
     rows.append(("CT", f"{size} voxels of {spacing} mm"))
     return rows + [("note", note) for note in patient.notes]
 

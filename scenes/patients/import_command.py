@@ -9,6 +9,7 @@ from errors import PatientError
 from scenes.atomic_files import check_folder
 from scenes.import_findings import FINDINGS_FILE, findings_text
 from scenes.patients.patient_folder import save_patient, without_identifiers
+from scenes.patients.patient_position import POSITIONS, Position
 from scenes.patients.readers.segment_names import Side
 from scenes.scene import scene_text
 from scenes.terminal import bar, shell_command
@@ -51,6 +52,11 @@ LABEL = "Names or values of the labels"
     help="What the organ rests on: a mould of its underside, a bed made from the labels around it (labels), or a surface in a "
     "file (LPS, mm).",
 )
+@click.option(
+    "--position",
+    type=click.Choice(POSITIONS),
+    help="How the patient lay in the CT [the CT's header, else supine]; left-decubitus is on the left side.",
+)
 def import_patient_command(
     ct: Path,
     labels: tuple[Path, ...],
@@ -61,14 +67,15 @@ def import_patient_command(
     series: str | None,
     seed: str | None,
     support: str,
+    position: Position | None,
     **words: str | None,
 ) -> None:
     """Make a patient's folder from a CT and its LABELS.
 
     The folder contains the scene to rehearse.
 
-    CT: a folder with DICOM, a DICOMDIR or zip archive, a NIfTI, NRRD or MHA file. LABELS: label maps, a folder with one
-    file per organ, DICOM-SEG, RTSTRUCT; by default the segmentation in the CT's folder.
+    CT: a folder with DICOM, a DICOMDIR or zip archive, a NIfTI, NRRD or MHA file. LABELS: label maps, surfaces (STL,
+    PLY, OBJ), a folder with one file per organ, DICOM-SEG, RTSTRUCT; by default the segmentation in the CT's folder.
     """
     if lists:
         from scenes.patients.import_listing import listing_text
@@ -86,8 +93,10 @@ def import_patient_command(
 
     tissues = {TISSUE_OPTIONS[o]: label_words(text, o) for o, text in words.items() if text is not None}
     own = [] if organ is None else label_words(organ, "organ")
-    position = None if seed is None else position_mm(seed)
-    patient, identifiers = import_request(ct, labels, own, tissues, side, series, position, support, bar)
+    seed_place = None if seed is None else position_mm(seed)
+    patient, identifiers = import_request(
+        ct, labels, own, tissues, side, series, seed_place, support, position, bar
+    )
     patient = without_identifiers(patient, identifiers)
     rows = summary_rows(patient)
     texts = {

@@ -9,12 +9,14 @@ import numpy as np
 
 from errors import PatientError
 from scenes.patients.patient_import import Patient, import_patient
+from scenes.patients.patient_position import Position
 from scenes.patients.readers.ct_series import ct_candidates, open_ct, read_dicom_headers
 from scenes.patients.readers.dicom_headers import DicomContents
 from scenes.patients.readers.label_files import Segmentation, open_labels, segmentation_of
 from scenes.patients.readers.label_maps import absent_labels, assign_tissues, merge_label_maps
 from scenes.patients.readers.segment_names import Side
 from scenes.patients.readers.series_choice import choose_series
+from scenes.patients.readers.volume_folder import volume_files
 from scenes.patients.region_growing import draft_segmentation
 from scenes.terminal import Progress, silent
 from scenes.volumes.dicom_references import NO_REFERENCES, DicomReferences, doubts, mismatch
@@ -31,6 +33,7 @@ def import_request(
     series: str | None = None,
     seed_mm: np.ndarray | None = None,
     support: str = "mould",
+    position: Position | None = None,
     progress: Progress = silent,
 ) -> tuple[Patient, dict[str, str]]:
     """The imported patient, and the identifiers that none of its files may contain, with where each stands.
@@ -39,7 +42,7 @@ def import_request(
         ct, labels: paths of the user.
         organ: names or values of its labels.
         tissues: tissue -> names or values of its labels.
-        side, support: as in ``import_patient``.
+        side, support, position: as in ``import_patient``.
         series: number or UID of one of several series.
         seed_mm: (3,) LPS; instead of labels.
         progress: shows the progress of each step.
@@ -69,8 +72,18 @@ def import_request(
         volume = open_ct(ct, series, progress=progress)
         merged = draft_segmentation(volume, seed_mm)
     own = merged.values_of(organ) if organ else None
-    patient = import_patient(volume, merged, own, side, support=support, given=tissues, progress=progress)
-    notes = [note for segmentation in segmentations for note in segmentation.notes]
+    patient = import_patient(
+        volume,
+        merged,
+        own,
+        side,
+        support=support,
+        given=tissues,
+        position=position,
+        progress=progress,
+    )
+    # Several files of one kind have the same note.
+    notes = dict.fromkeys(note for segmentation in segmentations for note in segmentation.notes)
     found = replace(patient, notes=(*patient.notes, *notes, *absent), draft=seed_mm is not None)
     return found, _identifiers((ct, *labels), volume, segmentations)
 
@@ -96,7 +109,7 @@ def _segmentations(
     progress: Progress,
 ) -> list[Segmentation]:
     """The segmentations of the paths, else the one among the DICOM files of the CT."""
-    candidates = ct_candidates(ct, contents) if contents else []
+    candidates = [] if contents is None or volume_files(ct) else ct_candidates(ct, contents)
     if series is not None and candidates:
         candidates = [choose_series(ct, candidates, series)[0]]
     own = [one.references for one in candidates]

@@ -5,7 +5,6 @@ from scipy import ndimage
 
 from scenes.patients.organ_selection import BODY_ABOVE_HU, Organ
 from scenes.patients.readers.label_maps import LabelMap, listed
-from scenes.patients.readers.segment_names import is_understood
 from scenes.volumes.voxel_grid import VoxelGrid
 
 BONE_ABOVE_HU = 300
@@ -103,7 +102,7 @@ def label_warnings(labels: LabelMap, piece: Organ, is_named: bool) -> tuple[str,
             f"labels {names} have no names, and were all taken as the kidney; if they are not, give --organ, --tumour, --cyst"
         )
     around = ndimage.binary_dilation(piece.mask, iterations=2) & ~piece.mask
-    unknown = {v for v, s in labels.segments.items() if s.tissue is None and not is_understood(s.name)}
+    unknown = {v for v, s in labels.segments.items() if s.tissue is None and not s.is_understood}
     beside = [v for v in np.unique(piece.values[around]).tolist() if v in unknown]
     left_out = [(v, float((labels.values == v).sum()) * labels.grid.voxel_ml) for v in beside]
     shown = [f"{labels.segments[v]} ({ml:.1f} ml)" for v, ml in left_out if ml >= LEAST_LEFT_OUT_ML]

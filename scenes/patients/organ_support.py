@@ -7,6 +7,7 @@ the labelled tissue under the organ and the fat between, carved in the same mann
 
 from pathlib import Path
 
+import igl
 import numpy as np
 import trimesh
 from scipy import ndimage
@@ -15,7 +16,7 @@ from skimage.measure import marching_cubes
 from errors import PatientError
 from scenes.patients.label_surfaces import FACES, decimate
 from scenes.patients.readers.label_maps import LabelMap, resample_nearest
-from scenes.surfaces import load_surface, signed_distance_from
+from scenes.surfaces import in_lps, load_surface, signed_distance_from, stated_space
 from scenes.volumes.voxel_grid import VoxelGrid
 
 # Spacing of the sampling grid.
@@ -39,6 +40,14 @@ LEAST_UNDER = 0.5
 LEAST_ML = 2.0
 # A support may touch the organ at rest, but not compress it.
 MOST_OVERLAP_MM = 0.5
+
+# Vertical rays through the organ, apart by this.
+RAYS_MM = 4.0
+# At the start the organ falls until about this share of its projected area lies on the support: on a flat one that touches it, real
+# kidneys of the development data fall by up to 2.7 mm. After 5 mm the organ arrives with 0.3 m/s, and hangs on its pedicle.
+LANDS_ON, MOST_FALL_MM = 0.05, 5.0
+# The share of the organ's projected area that a support may have above it: the probe comes from there.
+MOST_COVERED = 0.1
 
 
 def mould(
@@ -124,13 +133,22 @@ def bed_of_labels(
         raise PatientError(f"no bed of labels fits: {error}; leave --support out for a mould") from error
 
 
-def bed_of_file(path: Path, organ: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A support from a file, LPS [mm]. Raises PatientError: not a closed surface, overlaps the organ, or far from it."""
+def bed_of_file(path: Path, organ: trimesh.Trimesh, gravity: np.ndarray) -> trimesh.Trimesh:
+    """A support from a file [mm], LPS unless it states RAS.
+
+    Args:
+        path: of an STL, PLY or OBJ file.
+        organ: watertight surface [mm], LPS.
+        gravity: its direction, shape (3,).
+
+    Raises:
+        PatientError: not a closed surface, overlaps the organ, far from it, or not under it.
+    """
     if not path.is_file():
         raise PatientError(
             f"{path}: no such file; give a surface for --support: mould, labels, or an STL, PLY or OBJ file"
         )
-    bed = load_surface(path)
+    bed = in_lps(load_surface(path), stated_space(path))
     expected = "in mm and in the CT's coordinates (LPS)"
     gap = least_gap(bed, organ)
     if gap < -MOST_OVERLAP_MM:
@@ -142,7 +160,69 @@ def bed_of_file(path: Path, organ: trimesh.Trimesh) -> trimesh.Trimesh:
         raise PatientError(
             f"{path}: is {apart:.0f} mm from the organ; expected a support under it, {expected}"
         )
+    _check_under(path, bed, organ, gravity)
     return trimesh.Trimesh(bed.vertices, bed.faces, process=False)
+
+
+def _check_under(path: Path, bed: trimesh.Trimesh, organ: trimesh.Trimesh, gravity: np.ndarray) -> None:
+    """Raises PatientError where a bed is not close under an organ along gravity, or covers it."""
+    gaps, covered = vertical_gaps(bed, organ, gravity)
+    share, above = float(np.mean(gaps <= REACH_MM)), float(covered.mean())
+    x, y, z = gravity
+    along = f"along gravity, which is ({x:g}, {y:g}, {z:g}) in LPS"
+    if share < LEAST_UNDER:
+        raise PatientError(
+            f"{path}: is under {share:.0%} of the organ and above {above:.0%} of it, {along}; expected under {LEAST_UNDER:.0%} or "
+            "more; move it under the organ, or leave --support out for a mould"
+        )
+    if above > MOST_COVERED:
+        raise PatientError(
+            f"{path}: covers {above:.0%} of the organ from above, {along}; expected at most {MOST_COVERED:.0%}, as the probe comes "
+            "from there; cut off what is above the organ"
+        )
+    fall = float(np.sort(gaps)[int(LANDS_ON * len(gaps))])
+    if fall > MOST_FALL_MM:
+        raise PatientError(
+            f"{path}: is {fall:.1f} mm under the organ, {along}, so that the organ would fall on it; expected at most "
+            f"{MOST_FALL_MM:g} mm; move it closer, fill the space between, or leave --support out for a mould"
+        )
+
+
+def vertical_gaps(
+    bed: trimesh.Trimesh, organ: trimesh.Trimesh, gravity: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of vertical rays through an organ: the gap [mm] from its underside to the bed, inf where there is none; and where the bed is above it.
+
+    Both have the shape (ray_count,); the rays are evenly spaced over the organ's projected area.
+    """
+    frame = _gravity_frame(np.asarray(gravity, float))
+    upright, under = _turned(organ, frame), _turned(bed, frame)
+    low, high = upright.bounds
+    bottom = min(low[2], under.bounds[0, 2]) - 1.0
+    # A fraction of the spacing that meets no vertices of a regular surface.
+    start, end = low + 0.37 * RAYS_MM, high
+    gaps, covered = [], []
+    for x in np.arange(start[0], end[0], RAYS_MM):
+        for y in np.arange(start[1], end[1], RAYS_MM):
+            own = _heights(upright, x, y, bottom)
+            if len(own) == 0:
+                continue
+            middle = 0.5 * (own.min() + own.max())
+            beds = _heights(under, x, y, bottom)
+            gaps.append(max(0.0, own.min() - max(beds[beds <= middle], default=-np.inf)))
+            covered.append(bool((beds > middle).any()))
+    return np.array(gaps), np.array(covered)
+
+
+def _heights(surface: trimesh.Trimesh, x: float, y: float, bottom: float) -> np.ndarray:
+    """Heights at which a vertical ray from under a surface meets it."""
+    hits = igl.ray_mesh_intersect(
+        np.array([x, y, bottom]),
+        np.array([0.0, 0.0, 1.0]),
+        np.ascontiguousarray(surface.vertices, float),
+        np.ascontiguousarray(surface.faces, np.int64),
+    )
+    return bottom + np.array([hit[1] for hit in hits])
 
 
 def least_gap(support: trimesh.Trimesh, organ: trimesh.Trimesh) -> float:

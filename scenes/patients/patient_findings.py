@@ -17,6 +17,7 @@ def findings_of(patient: Patient) -> ImportFindings:
         version=VERSION,
         side=patient.side,
         draft=patient.draft,
+        position=patient.position,
         extent_mm=_rounded(patient.organ.extents),
         surfaces={
             name: SurfaceFindings(

@@ -14,6 +14,8 @@ import trimesh
 
 from errors import PatientError
 from scenes.patients.import_warnings import fat_warnings, label_warnings, orientation_warnings, stone_warnings
+from scenes.patients.kidney_plausibility import kidney_warnings
+from scenes.patients.label_shift import shift_warnings
 from scenes.patients.organ_selection import (
     HILAR,
     LESIONS,
@@ -31,13 +33,13 @@ from scenes.patients.part_surfaces import (
     part_surfaces_in_processes,
     parts_elsewhere,
 )
+from scenes.patients.patient_position import GRAVITY, Position, position_of, position_warnings
 from scenes.patients.readers.label_maps import Colour, LabelMap, present_values, resample_nearest
 from scenes.patients.readers.segment_names import Side
 from scenes.terminal import Progress, silent
 from scenes.volumes.lazy_volume import LazyVolume
 from scenes.volumes.voxel_grid import Box, VoxelGrid
 
-SUPINE_GRAVITY = np.array([0.0, 1.0, 0.0])  # as in the CT: on the back, posterior is down
 PLAUSIBLE_ORGAN_HU = (-150.0, 600.0)
 PLAUSIBLE_ORGAN_ML = (20.0, 2000.0)
 CUT_AREA_MM2 = 100.0  # a pole that only touches the border is complete to within a slice
@@ -67,6 +69,7 @@ class Patient:
     warnings: tuple[str, ...] = ()  # what looks wrong or was assumed
     colours: dict[str, Colour] = field(default_factory=dict)  # of organ and parts, where labels have one
     draft: bool = False  # made by region growing
+    position: Position = "supine"  # in the CT, which gives gravity
 
     @property
     def tumour(self) -> trimesh.Trimesh | None:
@@ -81,6 +84,7 @@ def import_patient(
     margin_mm: float = 60.0,
     support: str = "mould",
     given: Collection[str] = (),
+    position: Position | None = None,
     progress: Progress = silent,
 ) -> Patient:
     """Crop one organ from a CT and its label map, and make its surfaces and its support.
@@ -94,6 +98,7 @@ def import_patient(
         margin_mm: CT kept around the organ [mm].
         support: what the organ rests on: a "mould" of its underside, a bed of the surrounding "labels", or a surface file.
         given: tissues whose labels the user named: a note tells which of them this organ does not have.
+        position: how the patient lay in the CT; None: as in its header, else supine.
         progress: shows the progress of the surfaces.
 
     Raises:
@@ -116,9 +121,16 @@ def import_patient(
     def of(*wanted: str) -> np.ndarray:
         return np.isin(coded, [code for code, tissue in tissues.items() if tissue in wanted])
 
+    actual_position, position_notes = position_of(ct.patient_position, position)
+    overview = _overview(level, level_hu)
     warnings = (
+        *position_warnings(overview, actual_position),
         *orientation_warnings(level, level_hu, labels, midline),
-        *fat_warnings(grid, hounsfield, on_ct, of("kidney")),
+        # Fat in the rim of a label that is shifted by a few millimetres has the same cause.
+        *(
+            shift_warnings(grid, hounsfield, piece.grid, piece.mask)
+            or fat_warnings(grid, hounsfield, on_ct, of("kidney"))
+        ),
         *stone_warnings(grid, hounsfield, of("kidney", "cortex", "medulla", "sinus"), of("urine")),
         *label_warnings(labels, piece, organ is not None),
     )
@@ -127,7 +139,8 @@ def import_patient(
     with part_surfaces_in_processes(found) as parts_made:
         surface = organ_surface(piece)
         _check_surface(surface, piece)
-        bed = _support(support, surface, labels, piece)
+        warnings += kidney_warnings(piece, labels, surface, actual_side, midline)
+        bed = _support(support, surface, labels, piece, actual_position)
         parts = parts_made(progress)
     volumes = {part: float(inside.sum() * part_grid.voxel_ml) for part, (part_grid, inside) in found.items()}
     return Patient(
@@ -139,23 +152,27 @@ def import_patient(
         support=bed,
         side=actual_side,
         volumes_ml={"organ": piece.volume_ml, **{part: volumes[part] for part in parts}},
-        overview=_overview(level, level_hu),
+        overview=overview,
         source=ct.grid,
         series=ct.series,
-        notes=(*ct.notes, *part_notes),
+        notes=(*ct.notes, *position_notes, *part_notes),
         warnings=(*warnings, *part_warnings),
         colours=colours_of_labels(labels, [*parts]),
+        position=actual_position,
     )
 
 
-def _support(kind: str, organ: trimesh.Trimesh, labels: LabelMap, piece: Organ) -> trimesh.Trimesh:
+def _support(
+    kind: str, organ: trimesh.Trimesh, labels: LabelMap, piece: Organ, position: Position
+) -> trimesh.Trimesh:
+    gravity = np.array(GRAVITY[position])
     if kind == "labels":
         own = [int(value) for value in np.unique(piece.values[piece.mask])]
-        return bed_of_labels(organ, labels, [*own, *labels.of_tissues(*HILAR)], SUPINE_GRAVITY)
+        return bed_of_labels(organ, labels, [*own, *labels.of_tissues(*HILAR)], gravity)
     if kind != "mould":
-        return bed_of_file(Path(kind), organ)
+        return bed_of_file(Path(kind), organ, gravity)
     try:
-        return mould(organ, SUPINE_GRAVITY)
+        return mould(organ, gravity)
     except ValueError as error:
         raise PatientError(f"no support fits under the organ: {error}; check the organ's label") from error
 

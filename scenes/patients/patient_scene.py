@@ -8,8 +8,9 @@ from scenes.mechanical_tissues import mechanical_properties
 from scenes.patients.organ_selection import LESIONS, PARENCHYMA
 from scenes.patients.part_surfaces import PARTS
 from scenes.patients.patient_import import Patient
+from scenes.patients.patient_position import GRAVITY
 from scenes.patients.readers.segment_names import Side
-from scenes.scene import AnatomyFiles, Attachment, Image, MeshShape, Scene
+from scenes.scene import AnatomyFiles, Attachment, Gravity, Image, MeshShape, Scene
 
 FAT_HU = -110.0
 LEAST_WINDOW_HU = 310.0  # up to 200 HU at least, or an unenhanced kidney is white
@@ -38,7 +39,7 @@ def hilum(organ: trimesh.Trimesh, side: Side) -> tuple[float, float, float]:
 
 
 def patient_scene(patient: Patient) -> Scene:
-    """The scene that an import writes into the patient's folder: supine, on its support."""
+    """The scene that an import writes into the patient's folder: lying as in the CT, on its support."""
     tumour = None if patient.tumour is None else "tumour.stl"
     own = [code for code, tissue in patient.tissues.items() if tissue in (*PARENCHYMA, *LESIONS)]
     hu = sitk.GetArrayViewFromImage(patient.ct)[np.isin(sitk.GetArrayViewFromImage(patient.labels), own)]
@@ -57,6 +58,7 @@ def patient_scene(patient: Patient) -> Scene:
                 tissues={str(code): tissue for code, tissue in patient.tissues.items()},
             )
         ),
+        gravity=Gravity(direction=GRAVITY[patient.position]),
         attachment=Attachment(
             at_mm=hilum(patient.organ, patient.side),
             radius_mm=PEDICLE_RADIUS_MM,

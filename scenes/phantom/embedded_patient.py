@@ -59,4 +59,6 @@ def make_embedded_patient(progress: ReportProgress = no_progress) -> "Patient":
     labels = LabelMap.of(image)
     segments = {v: replace(segment, tissue=Label(v).name.lower()) for v, segment in labels.segments.items()}
     organ = [value for value in segments if value != Label.TUMOUR]
-    return import_patient(LazyVolume.of(ct), replace(labels, segments=segments), organ, side="left")
+    return import_patient(
+        LazyVolume.of(ct), replace(labels, segments=segments), organ, side="left", position="supine"
+    )

@@ -34,6 +34,7 @@ class LazyVolume:
     notes: tuple[str, ...] = ()  # for the user: what was chosen, left out or resampled
     references: DicomReferences = NO_REFERENCES  # the DICOM objects that it consists of
     series: str = ""  # number of the DICOM series
+    patient_position: str = ""  # DICOM's term, such as HFS, where there is one
     # Of the patient (PHI), and where each stands; no written file may contain them.
     identifiers: Mapping[str, str] = field(default_factory=dict)
     # Of a file's header, with the names of its labels.

@@ -42,7 +42,7 @@ def real_patient(data: Path, tmp_path: Path) -> tuple[Scene, Path]:
     """A coarse scene of a patient on a slab, and the folder of its files."""
     ct, labels = (sitk.DICOMOrient(open_ct(data / "ct" / name).image(), AXES) for name in CRLM)
     slab = trimesh.creation.box([60.0, 10.0, 80.0])
-    slab.apply_translation([-57.0, 60.0, -322.0])
+    slab.apply_translation([-57.0, 52.0, -322.0])
     slab.export(tmp_path / "slab.stl")
     patient = import_patient(
         LazyVolume.of(ct), LabelMap.of(labels), side="right", support=str(tmp_path / "slab.stl")

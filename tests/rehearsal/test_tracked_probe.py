@@ -296,7 +296,8 @@ def poses_file(path: Path, track: TimedPoses) -> Path:
 
 def test_a_sweep_and_a_list_of_poses_give_the_same_way(tmp_path):
     track = way()
-    for path in (sweep_file(tmp_path / "a.igs.mha", track), poses_file(tmp_path / "a.json", track)):
+    sweeps = (sweep_file(tmp_path / f"a.igs.{kind}", track) for kind in ("mha", "nrrd"))
+    for path in (*sweeps, poses_file(tmp_path / "a.json", track)):
         found = load_track(path)
         assert np.array_equal(found.times_s, track.times_s)
         assert all(np.array_equal(a, b) for a, b in zip(found.poses, track.poses, strict=True))

@@ -7,13 +7,15 @@ import trimesh
 from synthetic_body import LEFT, TUMOUR, assert_sound, body, coarsely, drawn, grid_around, least_gap, level
 
 from errors import PatientError
-from scenes.patients.organ_support import bed_of_file, bed_of_labels
-from scenes.patients.patient_import import SUPINE_GRAVITY, import_patient
+from scenes.patients.organ_support import bed_of_file, bed_of_labels, mould, vertical_gaps
+from scenes.patients.patient_import import import_patient
+from scenes.patients.patient_position import GRAVITY
 from scenes.patients.readers.label_maps import LabelMap
 from scenes.volumes.lazy_volume import LazyVolume
 
 # A muscle behind the left kidney, with 4 mm of fat between.
 MUSCLE = np.array([70.0, 79.0, 12.0]), np.array([45.0, 20.0, 70.0])
+SUPINE = np.array(GRAVITY["supine"])
 NAMES = {2: "kidney_left", 3: "tumour", 4: "psoas"}
 SMALL = np.array([10.0, -20.0, 30.0]), np.array([13.0, 11.0, 18.0])
 
@@ -24,7 +26,7 @@ def small_organs_bed(muscle: tuple[np.ndarray, np.ndarray]) -> tuple[trimesh.Tri
     organ.vertices = organ.vertices * SMALL[1] + SMALL[0]
     empty = grid_around(SMALL[0] - 50, SMALL[0] + 50, (2.5, 2.5, 2.5))
     labels = LabelMap.of(drawn(empty, (4, muscle), (2, SMALL)), NAMES)
-    return organ, bed_of_labels(organ, labels, [2, 3], SUPINE_GRAVITY)
+    return organ, bed_of_labels(organ, labels, [2, 3], SUPINE)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +48,7 @@ class TestBedOfLabels:
         assert_sound(patient.support)
         assert 0 < least_gap(patient.support, patient.organ) < 1.0
         # Behind the organ's middle the bed begins at the organ, and goes on as the muscle does.
-        behind = LEFT[0] + np.outer(LEFT[1][1] + np.array([-1.0, 1.5, 4.0, 15.0]), SUPINE_GRAVITY)
+        behind = LEFT[0] + np.outer(LEFT[1][1] + np.array([-1.0, 1.5, 4.0, 15.0]), SUPINE)
         faces = np.asarray(patient.support.faces, np.int64)
         distance = igl.signed_distance(behind, np.asarray(patient.support.vertices), faces)[0]
         assert (distance < 0).tolist() == [False, True, True, True]
@@ -101,8 +103,94 @@ class TestBedOfFile:
             ("absent", "no such file"),
         ]:
             with pytest.raises(PatientError, match=words) as caught:
-                bed_of_file(tmp_path / f"{name}.stl", patient.organ)
+                bed_of_file(tmp_path / f"{name}.stl", patient.organ, SUPINE)
             assert "\n" not in str(caught.value) and f"{name}.stl" in str(caught.value)
+
+
+@pytest.fixture
+def organ() -> trimesh.Trimesh:
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    return trimesh.Trimesh(ball.vertices * LEFT[1] + LEFT[0], ball.faces)
+
+
+class TestUnderTheOrgan:
+    """A support of the user's is under the organ along gravity, and close, or the organ leaves it."""
+
+    @staticmethod
+    def box(folder, size, centre):
+        """A box of a size at a centre relative to the organ's [mm]."""
+        mesh = trimesh.creation.box(size)
+        mesh.apply_translation(LEFT[0] + centre)
+        mesh.export(folder / "bed.stl")
+        return folder / "bed.stl"
+
+    @pytest.mark.parametrize(("position", "axis"), [("supine", 1), ("left-decubitus", 0)])
+    @pytest.mark.parametrize("gap", [0.2, 3.0])
+    def test_a_slab_under_it(self, tmp_path, organ, position, axis, gap):
+        gravity = np.array(GRAVITY[position])
+        size = np.full(3, 120.0)
+        size[axis] = 10.0
+        slab = self.box(tmp_path, size, gravity * (LEFT[1][axis] + gap + 5))
+        bed_of_file(slab, organ, gravity)
+        with pytest.raises(PatientError, match="is under 0% of the organ and above 100% of it"):
+            bed_of_file(slab, organ, -gravity)
+
+    @pytest.mark.parametrize(
+        ("size", "centre", "words"),
+        [
+            (
+                (80, 10, 120),
+                (0, -27, 0),
+                "is under 0% of the organ and above 100% of it, .*expected under 50%",
+            ),
+            ((10, 60, 120), (32, 0, 0), "is under 0% of the organ and above 0%"),
+            ((80, 10, 30), (0, 26, 40), r"is under \d\d?% of the organ.*expected under 50%"),
+            ((80, 10, 120), (0, 40, 0), r"is 15\.[56] mm under the organ, .*expected at most 5 mm"),
+            ((80, 10, 120), (0, 31, 0), r"is 6\.[56] mm under the organ"),
+        ],
+        ids=["in front", "beside it", "under one end", "far under it", "under it, not close"],
+    )
+    def test_elsewhere(self, tmp_path, organ, size, centre, words):
+        with pytest.raises(PatientError, match=words) as caught:
+            bed_of_file(self.box(tmp_path, size, centre), organ, SUPINE)
+        assert "(0, 1, 0) in LPS" in str(caught.value) and "\n" not in str(caught.value)
+
+    def test_a_pin_is_no_support(self, tmp_path, organ):
+        """Though it touches the organ, and a slab is under all of it."""
+        pin = trimesh.creation.box([4.0, 14.0, 4.0])
+        pin.apply_translation(LEFT[0] + [0, 20.2 + 7, 0])
+        slab = trimesh.creation.box([80.0, 10.0, 120.0])
+        slab.apply_translation(LEFT[0] + [0, 39, 0])
+        trimesh.util.concatenate([pin, slab]).export(tmp_path / "pin.stl")
+        with pytest.raises(PatientError, match=r"is 1[45]\.\d mm under the organ"):
+            bed_of_file(tmp_path / "pin.stl", organ, SUPINE)
+
+    def test_a_cover(self, tmp_path, organ):
+        both = [trimesh.creation.box([80.0, 10.0, 120.0]) for _ in range(2)]
+        both[0].apply_translation(LEFT[0] + [0, 26, 0])
+        both[1].apply_translation(LEFT[0] + [0, -45, 0])
+        trimesh.util.concatenate(both).export(tmp_path / "cover.stl")
+        with pytest.raises(PatientError, match="covers 100% of the organ from above.*expected at most 10%"):
+            bed_of_file(tmp_path / "cover.stl", organ, SUPINE)
+
+    def test_the_programs_own_supports(self, tmp_path, organ, monkeypatch):
+        monkeypatch.setattr("scenes.patients.organ_support.GRID_MM", 2.0)
+        for position in ("supine", "prone", "right-decubitus"):
+            gravity = np.array(GRAVITY[position])
+            mould(organ, gravity).export(tmp_path / "mould.stl")
+            bed_of_file(tmp_path / "mould.stl", organ, gravity)
+
+    def test_gaps_are_those_along_gravity(self, organ):
+        """Under an ellipsoid, at a share s of its projected area, a plane d below is d + c (1 - sqrt(1 - s)) away."""
+        slab = trimesh.creation.box([120.0, 10.0, 120.0])
+        slab.apply_translation(LEFT[0] + [0, LEFT[1][1] + 2 + 5, 0])
+        gaps, covered = vertical_gaps(slab, organ, SUPINE)
+        shares = (np.arange(len(gaps)) + 0.5) / len(gaps)
+        expected = 2 + LEFT[1][1] * (1 - np.sqrt(1 - shares))
+        # The number of rays within an ellipse is its area's to about a ray in each row of 12; there are 22 mm per share at most.
+        inner = shares < 0.8
+        assert len(gaps) > 150 and not covered.any()
+        assert np.abs(np.sort(gaps) - expected)[inner].max() < 22 * 12 / len(gaps)
 
 
 def test_a_surface_that_faces_inward(tmp_path):
@@ -113,4 +201,4 @@ def test_a_surface_that_faces_inward(tmp_path):
     box.invert()
     box.export(tmp_path / "in.stl")
     with pytest.raises(PatientError, match="faces outward"):
-        bed_of_file(tmp_path / "in.stl", ball)
+        bed_of_file(tmp_path / "in.stl", ball, SUPINE)

@@ -22,6 +22,7 @@ def findings(*acknowledged: bool) -> dict:
         version="2.0",
         side="left",
         draft=False,
+        position="supine",
         extent_mm=[50, 50, 100],
         surfaces=dict(organ=dict(faces=500, volume_ml=150.0, label_ml=151.0)),
         series="3",

@@ -41,7 +41,7 @@ def grids(draw, low, high, along=SPACING):
 @pytest.fixture(autouse=True)
 def _without_the_support(monkeypatch):
     """Which is tested by itself, and takes most of the time."""
-    monkeypatch.setattr(scenes.patients.patient_import, "_support", lambda kind, organ, labels, piece: organ)
+    monkeypatch.setattr(scenes.patients.patient_import, "_support", lambda kind, organ, *_: organ)
 
 
 @settings(max_examples=5, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))

@@ -6,12 +6,16 @@ import pytest
 import SimpleITK as sitk
 import trimesh
 from conftest import DATA
-from synthetic_body import assert_sound, least_gap, voxels_to_boundary
+from synthetic_body import assert_sound, coarsely, least_gap, voxels_to_boundary
 from test_patient_import import label_map
 
+from scenes.patients.kidney_plausibility import kidney_warnings
+from scenes.patients.organ_selection import find_organs
 from scenes.patients.organ_support import mould
+from scenes.patients.part_surfaces import organ_surface
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.ct_series import open_ct
+from scenes.patients.readers.label_maps import LabelMap
 
 # A kidney of the other CT there, crlm_1004, is imported in test_app.py.
 CT, LABELS, VALUE, SIDE, VOLUME_ML = "totalseg/ct.nii.gz", "totalseg/kidneys.nii.gz", 2, "right", 188.8
@@ -22,6 +26,8 @@ def test_a_real_kidney():
     labels = open_ct(DATA / "ct" / LABELS).image()
     patient = import_patient(open_ct(DATA / "ct" / CT), *label_map(labels, [VALUE]))
     assert patient.side == SIDE
+    (warning,) = patient.warnings  # it has stones
+    assert "as bright as stone" in warning
     assert patient.organ.volume / 1000 == pytest.approx(VOLUME_ML, rel=0.01)
     assert len(patient.organ.faces) == pytest.approx(5000, abs=20)
     assert_sound(patient.organ)
@@ -29,6 +35,18 @@ def test_a_real_kidney():
     assert voxels_to_boundary(patient.organ, labels == VALUE).max() < 1
     assert least_gap(patient.support, patient.organ) > 0
     assert sitk.GetArrayViewFromImage(patient.ct).min() >= -1024
+
+
+@pytest.mark.skipif(not (DATA / "ct").is_dir(), reason="real data (../shared/data/ct) is not here")
+@pytest.mark.parametrize("name", [LABELS, "crlm_1004_labels/kidneys_provisional.nii.gz"])
+def test_real_kidneys_are_plausible(name, monkeypatch):
+    """Of labels of 3 and 5 mm."""
+    coarsely(monkeypatch)
+    labels = LabelMap.of(open_ct(DATA / "ct" / name).image())
+    right, left = find_organs(labels)
+    midline = 0.5 * (right.centre_x_mm + left.centre_x_mm)
+    for piece, side in ((right, "right"), (left, "left")):
+        assert kidney_warnings(piece, labels, organ_surface(piece), side, midline) == ()
 
 
 @pytest.mark.skipif(

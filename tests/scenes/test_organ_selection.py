@@ -134,7 +134,7 @@ def test_vessels_are_no_bed(ct_and_labels, monkeypatch):
 
 def test_marks_of_the_organ_alone(ct_and_labels, monkeypatch):
     """A tumour of the other kidney is none of this patient's, and what grows in no organ is not drawn."""
-    monkeypatch.setattr(scenes.patients.patient_import, "_support", lambda kind, organ, labels, piece: organ)
+    monkeypatch.setattr(scenes.patients.patient_import, "_support", lambda kind, organ, *_: organ)
     ct, labels = ct_and_labels
     other = RIGHT[0] + [25.0, 0, 0], np.full(3, 10.0)
     named = LabelMap.of(

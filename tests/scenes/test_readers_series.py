@@ -53,7 +53,47 @@ class TestGeometry:
             tmp_path, DIRECTIONS["identity"], size=(12, 10, 7), positions=lambda k: np.array([0, 0, at[k]])
         )
         voxels = read_ct(series.write())[1]
-        assert voxels.shape[0] == 8 and np.array_equal(voxels[-1], series.hounsfield[-1])
+        assert voxels.shape[0] == 15 and np.array_equal(voxels[-1], series.hounsfield[-1])
+
+
+class TestUnevenGaps:
+    """Slices that alternate between two values lose their contrast on a grid that is coarser than they are, or misses them."""
+
+    @pytest.mark.parametrize(
+        "gaps",
+        [(5, 7, 5, 7, 5), (7, 7, 5, 7, 7), (5, 6, 7, 5.5, 6.5), (2.5, 3.5, 2.5, 3.5, 3.5), (5.02, 6.97, 5, 7.04, 6.99)],
+        ids=str,
+    )  # fmt: skip
+    def test_nothing_finer_is_lost(self, tmp_path, gaps):
+        at = np.concatenate([[0.0], np.cumsum(gaps)])
+        series = Series(
+            tmp_path, DIRECTIONS["identity"], field=lambda places: np.interp(places[..., 2], at, [0, 900] * 3),
+            positions=lambda k: np.array([0, 0, at[k]]),
+        )  # fmt: skip
+        volume, voxels = read_ct(series.write((3, 0, 5, 1, 4, 2)))
+        gap = volume.grid.spacing[2]
+        assert gap <= min(gaps) and f"resampled to {gap:.2f} mm" in " ".join(volume.notes)
+        planes = volume.grid.place([[0, 0, k] for k in range(len(voxels))])[:, 2]
+        np.testing.assert_allclose(planes[[0, -1]], at[[0, -1]], atol=1e-6)
+        # A slice within a tenth of a plane of it is taken as it is.
+        expected = np.interp(planes, at, [0, 900] * 3)
+        assert np.abs(voxels[:, 0, 0] - expected).max() <= 0.1 * gap * 900 / min(gaps) + 1
+        nearest = np.abs(planes[:, None] - at).argmin(axis=0)
+        assert np.array_equal(voxels[nearest], series.hounsfield)
+
+    def test_no_more_planes_than_a_ct_resolves(self, tmp_path):
+        """Of gaps without a common measure the planes are half a millimetre apart or more."""
+        at = np.concatenate([[0.0], np.cumsum([1.57, 1.13, 1.23, 1.31, 1.49])])
+        series = Series(tmp_path, DIRECTIONS["identity"], positions=lambda k: np.array([0, 0, at[k]]))
+        volume, _ = read_ct(series.write())
+        assert 0.45 <= volume.grid.spacing[2] <= 1.13
+
+    @pytest.mark.parametrize("gap", [0.4, 0.6])
+    def test_the_finest_gap_of_thin_slices_is_kept(self, tmp_path, gap):
+        at = gap * np.array([0, 1, 2.4, 3.4, 4.4, 5.8])
+        series = Series(tmp_path, DIRECTIONS["identity"], positions=lambda k: np.array([0, 0, at[k]]))
+        volume, _ = read_ct(series.write())
+        assert 0.8 * gap < volume.grid.spacing[2] <= gap
 
 
 class TestSpacings:

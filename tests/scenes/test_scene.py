@@ -228,6 +228,7 @@ def test_the_embedded_patient_is_made_once():
         ("a.PNG", "is a picture; expected a scene file"),
         ("ct.nii.gz", "app.py import"),
         ("sweep-001.igs.mha", "a tracked sweep: give it to app.py reconstruct"),
+        ("sweep-001.igs.nrrd", "a tracked sweep: give it to app.py reconstruct"),
         ("session-001.jsonl", "a session: give it to rehearse --replay"),
         ("plan.json", "rehearse --plan"),
     ],

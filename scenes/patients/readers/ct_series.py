@@ -21,6 +21,7 @@ from scenes.patients.readers.series_choice import (
     series_of_labels,
 )
 from scenes.patients.readers.slice_stack import stack_slices
+from scenes.patients.readers.volume_folder import only_volume, volume_files
 from scenes.terminal import Progress, silent
 from scenes.volumes.dicom_references import NO_REFERENCES, DicomReferences
 from scenes.volumes.lazy_volume import LazyVolume
@@ -76,7 +77,9 @@ def list_ct(path: Path, progress: Progress = silent) -> CtListing:
         raise PatientError(f"{path}: no such file or folder; check the path")
     if path.is_file() and is_volume_file(path):
         return CtListing([_row_of_file(file_volume(path))], [])
-    found = read_dicom_headers(path, progress)
+    found, volumes = read_dicom_headers(path, progress), volume_files(path)
+    if volumes and not found.candidates and not found.labels:
+        return CtListing([_row_of_file(only_volume(path, volumes))], [])
     candidates = in_order(found.candidates if found.labels else ct_candidates(path, found))
     patients = patient_numbers(candidates)
     numbers = [s.number for s in candidates]
@@ -99,7 +102,7 @@ def open_ct(
 
     Args:
         path: a folder with DICOM files, in subfolders too; a DICOMDIR; a zip archive of DICOM files; an enhanced CT;
-            a .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd file.
+            a .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd file, or a folder with one that is not named as labels.
         series: number or UID (or its end) of one of several series.
         labels: what the labels refer to; their series is preferred.
         grid: the labels' own voxels, where they are a label map.
@@ -115,16 +118,25 @@ def open_ct(
         if series is not None:
             raise PatientError(f"{path}: has no series; leave --series out")
         return file_volume(path)
-    found = found or read_dicom_headers(path, progress)
+    found, volumes = found or read_dicom_headers(path, progress), volume_files(path)
+    if volumes and not found.candidates:
+        if series is not None:
+            raise PatientError(f"{path}: has no DICOM series; leave --series out")
+        return only_volume(path, volumes)
     chosen, notes = choose_series(path, ct_candidates(path, found), series, labels, grid)
     if found.others:
         notes.append(f"left out, no CT slices: {', '.join(_counted(found.others))}")
+    if volumes:
+        # No names, which may be the patient's.
+        notes.append(f"left out, beside the DICOM files: {len(volumes)} NIfTI, NRRD or MHA files")
     volume = _series_volume(path, chosen, progress)
     return replace(volume, notes=(*notes, *volume.notes))
 
 
 def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
-    """The contents of a folder, DICOMDIR or archive with DICOM files. Raises PatientError where there are none."""
+    """The contents of a folder, DICOMDIR or archive with DICOM files. Raises PatientError where there are neither these nor other
+    volumes.
+    """
     items = find_dicom_files(path)
     if not items and path.name.lower().endswith(SURFACE_ENDINGS):
         raise PatientError(
@@ -136,7 +148,7 @@ def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
             f"{path}: unknown kind of file; expected DICOM (a folder, a DICOMDIR or a zip archive), or a file that ends in "
             f"{', '.join(ENDINGS)}; convert it"
         )
-    if not items:
+    if not items and not volume_files(path):
         raise PatientError(
             f"{path}: no DICOM file found; give the folder of the slices, or a NIfTI, NRRD or MHA file"
         )
@@ -166,12 +178,16 @@ def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume
         notes.append(f"left out, localisers: {series.localizers + left_out}")
     if not all(one.is_rescaled for one in slices):
         notes.append("the files have no rescale: their values were taken as HU")
+    positions = {one.patient_position for one in slices}
+    if len(positions) > 1:
+        notes.append("the slices have different PatientPositions: none was taken")
     stack = stack_slices(str(path), slices, lambda files: progress(files, "slices"))
     return replace(
         stack,
         notes=(*notes, *stack.notes),
         references=series.references,
         series=series.number,
+        patient_position=positions.pop() if len(positions) == 1 else "",
         identifiers=identifiers_of(slices[0].item),
     )
 

@@ -30,7 +30,8 @@ TAGS = [
     "ImageType", "FrameOfReferenceUID", "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing",
     "Rows", "Columns", "NumberOfFrames", "RescaleSlope", "RescaleIntercept", "RescaleType",
     "PixelPaddingValue", "PixelPaddingRangeLimit", "BurnedInAnnotation", "SamplesPerPixel",
-    "SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence", "PatientID", "StudyInstanceUID",
+    "PatientPosition", "SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence", "PatientID",
+    "StudyInstanceUID",
 ]  # fmt: skip
 IDENTIFYING = (
     "SOPClassUID", "Modality", "SeriesInstanceUID", "SeriesNumber", "FrameOfReferenceUID", "PatientID", "StudyInstanceUID",
@@ -62,6 +63,7 @@ class DicomSlice:
     intercept: float
     is_rescaled: bool  # whether the header has a rescale
     padding: tuple[int, int] | None  # range of raw values outside the field of view
+    patient_position: str = ""  # DICOM's term, such as HFS
 
     @property
     def normal(self) -> np.ndarray:
@@ -225,6 +227,7 @@ def _slice(
         intercept=intercept,
         is_rescaled=value("RescaleIntercept") is not None,
         padding=_padding(header),
+        patient_position=str(value("PatientPosition", "")).strip().upper(),
     )
 
 

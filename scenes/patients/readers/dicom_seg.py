@@ -18,7 +18,7 @@ from scenes.patients.readers.dicom_headers import TAGS, slices_of
 from scenes.patients.readers.identifiers import identifiers_of
 from scenes.patients.readers.label_headers import references_of
 from scenes.patients.readers.label_maps import LabelMap, Segment, Segmentation, is_left_out, note_of_left_out
-from scenes.patients.readers.segment_names import tissue_of
+from scenes.patients.readers.segment_codes import dicom_meaning
 from scenes.patients.readers.slice_stack import stack_slices
 from scenes.terminal import Progress, silent
 from scenes.volumes.voxel_grid import VoxelGrid
@@ -53,7 +53,7 @@ def read_segmentation(
     ):
         _complete(item, data)
         segmentation = hd.seg.Segmentation.from_dataset(data, copy=False)
-        segments = _segments(segmentation)
+        segments = _segments(item, segmentation)
         left_out = [one for one in segments if is_left_out(one, wanted)]
         kept = [one for one in segments if one not in left_out]
         maps, grid = _maps(item, segmentation, kept, progress)
@@ -124,17 +124,15 @@ def _complete(item: SourceFile, data: Dataset) -> None:
         data.FrameOfReferenceUID = generate_uid()
 
 
-def _segments(segmentation: hd.seg.Segmentation) -> list[Segment]:
+def _segments(item: SourceFile, segmentation: hd.seg.Segmentation) -> list[Segment]:
     """All segments, without the background, with the tissue of the coded property where the label names none."""
     found = []
     for number in segmentation.segment_numbers:
         if number == 0:  # background
             continue
         described = segmentation.get_segment_description(number)
-        segment = Segment.named(described.segment_label, int(number))
-        if segment.tissue is None:
-            segment = replace(segment, tissue=tissue_of(described.segmented_property_type.meaning))
-        found.append(segment)
+        meaning = dicom_meaning(described)
+        found.append(Segment.coded(item.name, described.segment_label, meaning, int(number)))
     return found
 
 

@@ -1,4 +1,4 @@
-"""Read labels: label maps, folders with one file per organ, 3D Slicer's .seg.nrrd, DICOM-SEG, RTSTRUCT."""
+"""Read labels: label maps, folders with one file per organ, 3D Slicer's .seg.nrrd, DICOM-SEG, RTSTRUCT, surfaces."""
 
 import re
 from collections.abc import Callable, Collection
@@ -21,12 +21,18 @@ from scenes.patients.readers.label_maps import (
     whole_numbers,
 )
 from scenes.patients.readers.rtstruct import read_structures
+from scenes.patients.readers.segment_codes import slicer_meaning
 from scenes.patients.readers.segment_names import is_far, side_of, tissue_of
+from scenes.patients.readers.surface_labels import read_surfaces
+from scenes.surfaces import ENDINGS as SURFACE_ENDINGS
+from scenes.surfaces import is_surface_file
 from scenes.terminal import Progress, silent
 from scenes.volumes.dicom_references import DicomReferences
 from scenes.volumes.lazy_volume import LazyVolume
 from scenes.volumes.volume_files import ENDINGS, file_volume, is_volume_file
 
+# Surfaces that no installed library reads.
+OTHER_SURFACES = (".vtk", ".vtp", ".vtu", ".3mf", ".fbx")
 SLICER_KEY = re.compile(r"Segment(\d+)_Name$")
 
 
@@ -44,8 +50,8 @@ def open_labels(
     """Read labels.
 
     Args:
-        path: a label map or .seg.nrrd file, a folder with one file per organ, a DICOM-SEG or RTSTRUCT, or a folder or
-            archive with one of these.
+        path: a label map or .seg.nrrd file, a surface, a folder with one file per organ, a DICOM-SEG or RTSTRUCT, or a
+            folder or archive with one of these.
         wanted: names or values of segments, or files of a folder, to read, whatever their names.
         progress: shows the progress of headers, files and contours.
         belongs: selects one of several DICOM labels.
@@ -57,9 +63,12 @@ def open_labels(
         raise PatientError(f"{path}: no such file or folder; check the path")
     if path.is_file() and is_volume_file(path):
         return _label_map_file(path)
-    organ_files = sorted(file for file in path.iterdir() if is_volume_file(file)) if path.is_dir() else []
-    if organ_files:
-        return _file_per_organ(path, organ_files, wanted, progress)
+    if path.is_file() and is_surface_file(path):
+        return read_surfaces([path], NEAR_MM, progress)
+    if path.suffix.lower() in OTHER_SURFACES:
+        raise PatientError(f"{path}: is a surface that cannot be read here; export it as STL, PLY or OBJ")
+    if of_files := _files_of_folder(path, wanted, progress):
+        return of_files
     contents = read_dicom_headers(path, progress)
     found = segmentation_of(contents, wanted, progress, belongs)
     if found is None:
@@ -70,6 +79,24 @@ def open_labels(
             f"{path}: has no labels{a_ct}; expected a DICOM segmentation or structure set, or label maps; {order}"
         )
     return found
+
+
+def _files_of_folder(folder: Path, wanted: Collection[str], progress: Progress) -> Segmentation | None:
+    """The label maps of a folder, or its surfaces, one per organ; None without either. Raises PatientError."""
+    entries = sorted(folder.iterdir()) if folder.is_dir() else []
+    surfaces = [file for file in entries if is_surface_file(file)]
+    if organ_files := [file for file in entries if is_volume_file(file)]:
+        of_maps = _file_per_organ(folder, organ_files, wanted, progress)
+        note = f"label maps were read, and not the surfaces beside them: {len(surfaces)}"
+        return replace(of_maps, notes=(note,)) if surfaces else of_maps
+    if not surfaces:
+        return None
+    near = _near(surfaces, wanted)
+    if not near:
+        raise PatientError(
+            f"{folder}: has surfaces far from the kidneys alone; expected a kidney's; choose other labels"
+        )
+    return read_surfaces(near, NEAR_MM, progress)
 
 
 def segmentation_of(
@@ -138,7 +165,8 @@ def _names(volume: LazyVolume) -> dict[tuple[int, int], Segment]:
                     f"{volume.name}: {key} has no whole LabelValue and Layer; export it again from 3D Slicer"
                 )
             colour = (rgb[0], rgb[1], rgb[2]) if len(rgb) == 3 else None
-            found[int(layer), int(label)] = Segment.named(name, int(label), colour)
+            codes = slicer_meaning(volume.metadata.get(f"{start}Tags", ""))
+            found[int(layer), int(label)] = Segment.coded(volume.name, name, codes, int(label), colour)
     return found
 
 
@@ -146,8 +174,7 @@ def _file_per_organ(
     folder: Path, files: list[Path], wanted: Collection[str], progress: Progress
 ) -> Segmentation:
     """One mask per organ, as TotalSegmentator writes: the files name the organs, and may be empty."""
-    asked = {word.casefold() for word in wanted}
-    near = [f for f in files if _stem(f).casefold() in asked or not is_far(_stem(f))]
+    near = _near(files, wanted)
     # Kidneys first: of the others only the part near them is read.
     near.sort(key=lambda file: tissue_of(_stem(file)) != "kidney")
     maps: list[LabelMap] = []
@@ -179,10 +206,16 @@ def _file_per_organ(
     return Segmentation(lambda _: maps, identifiers=identifiers, grid=volume.grid, empty=tuple(empty))
 
 
+def _near(files: list[Path], wanted: Collection[str]) -> list[Path]:
+    """The files whose names are wanted, or not those of structures far from the kidneys."""
+    asked = {word.casefold() for word in wanted}
+    return [file for file in files if _stem(file).casefold() in asked or not is_far(_stem(file))]
+
+
 def _stem(path: Path) -> str:
     """A file's name without its extension."""
     name = path.name
-    for ending in (".seg.nrrd", ".nii.gz", *ENDINGS):
+    for ending in (".seg.nrrd", ".nii.gz", *ENDINGS, *SURFACE_ENDINGS):
         if name.lower().endswith(ending):
             return name[: -len(ending)]
     return name

@@ -10,7 +10,8 @@ import SimpleITK as sitk
 from scipy import ndimage
 
 from errors import PatientError
-from scenes.patients.readers.segment_names import Side, is_needless, side_of, tissue_of
+from scenes.patients.readers.segment_codes import CodedMeaning
+from scenes.patients.readers.segment_names import Side, is_needless, is_understood, side_of, tissue_of
 from scenes.volumes.dicom_references import NO_REFERENCES, DicomReferences
 from scenes.volumes.voxel_grid import Box, VoxelGrid
 
@@ -28,21 +29,51 @@ class Segment:
 
     name: str
     value: int | None  # in its file, if it has one
-    tissue: str | None  # by its name or the user; None: unknown, left to HU
-    side: Side | None  # by its name
+    tissue: str | None  # by its name, its codes or the user; None: unknown, left to HU
+    side: Side | None  # by its name or its codes
     colour: Colour | None = None  # in its file
+    meaning: str = ""  # of its codes, where the name is not understood
 
     @classmethod
     def named(cls, name: str, value: int | None = None, colour: Colour | None = None) -> Segment:
         """A segment with tissue and side by its name."""
         return cls(name, value, tissue_of(name), side_of(name), colour)
 
+    @classmethod
+    def coded(
+        cls, file: str, name: str, codes: CodedMeaning, value: int | None = None, colour: Colour | None = None
+    ) -> Segment:
+        """A segment with tissue and side by its name, or by its codes where the name is not understood.
+
+        Raises PatientError, which names the file, where the sides of name and codes differ.
+        """
+        named = cls.named(name, value, colour)
+        by_name = is_understood(name)
+        sides = {named.side} - {None} if by_name or not codes.sides else set()
+        sides |= codes.sides
+        if len(sides) > 1:
+            raise PatientError(
+                f"{file}: segment {named} has the codes {codes}, which are of another side than its name or than each other; "
+                "expected one side; correct the segment's name or terminology, for example in 3D Slicer"
+            )
+        side = next(iter(sides), None)
+        if by_name:
+            return replace(named, side=side)
+        meaning = str(codes) if is_understood(str(codes)) else ""
+        return replace(named, tissue=codes.tissue, side=side, meaning=meaning)
+
+    @property
+    def is_understood(self) -> bool:
+        """Whether its name or its codes are of a known structure, modelled or not."""
+        return is_understood(self.name) or bool(self.meaning)
+
     def matches(self, word: str) -> bool:
         """Whether a user's word is its name or its value."""
         return word.casefold() == self.name.casefold() or (self.value is not None and word == str(self.value))
 
     def __str__(self) -> str:
-        return " ".join(str(part) for part in (self.value, self.name) if part not in (None, ""))
+        meaning = f"({self.meaning})" if self.meaning else ""
+        return " ".join(str(part) for part in (self.value, self.name, meaning) if part not in (None, ""))
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,8 @@ SAME_GAP, PART_FROM_GAPS = 1.25, 3
 PARALLEL = 1e-3
 SAME_PLACE_MM = 1e-3
 MOST_GAP_MM = 10.0
+# Planes of a resampled stack are closer than the closest slices only down to this: no CT resolves less, and memory grows.
+FINEST_MM = 0.5
 
 
 def stack_slices(
@@ -189,11 +191,29 @@ def _even(
     gap = extent / len(gaps)
     if np.abs((along - along[0]) / gap - np.arange(len(along))).max() <= UNEVEN:
         return np.arange(len(along), dtype=float), float(gap)
-    gap = extent / max(1, round(extent / usual))
+    planes, gap = _finest_planes(along - along[0])
     notes.append(
         f"slices are {gaps.min():.2f} to {gaps.max():.2f} mm apart: resampled to {gap:.2f} mm, linearly between neighbours"
     )
-    return (along - along[0]) / gap, float(gap)
+    return planes, gap
+
+
+def _finest_planes(along: np.ndarray) -> tuple[np.ndarray, float]:
+    """Positions [mm] of unevenly spaced slices, the first at 0, on an even grid [planes], and its spacing [mm].
+
+    The spacing is at most the least gap: the largest with a plane at each slice, such as 1 mm for gaps of 5 and 7 mm. Where there is
+    none above FINEST_MM, it is the one with planes nearest to the slices.
+    """
+    closest = float(np.diff(along).min())
+    worst = []
+    for share in range(1, max(1, int(closest / FINEST_MM + UNEVEN)) + 1):
+        gap = along[-1] / np.ceil(along[-1] * share / closest - UNEVEN)
+        off = np.abs(along / gap - np.rint(along / gap)).max()
+        if off <= UNEVEN:
+            return along / gap, float(gap)
+        worst.append((off * gap, gap))
+    gap = min(worst)[1]
+    return along / gap, float(gap)
 
 
 def _parts_of_one_spacing(gaps: np.ndarray) -> list[slice]:
