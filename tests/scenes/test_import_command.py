@@ -218,13 +218,12 @@ class TestExchanged:
         with pytest.raises(PatientError, match=words):
             import_request(paths / ct, [paths / labels], side="left")
 
-    @pytest.mark.parametrize("n", [0, 1])
-    def test_a_surface(self, paths, n):
-        (paths / "bed.stl").write_bytes(b"solid")
-        given = [paths / "ct", paths / "seg.dcm"]
-        given[n] = paths / "bed.stl"
-        with pytest.raises(PatientError, match="is a surface; expected a CT or labels in voxels"):
-            import_request(given[0], given[1:])
+    def test_a_surface(self, paths):
+        (paths / "kidney.stl").write_bytes(b"solid")
+        with pytest.raises(
+            PatientError, match="is a surface; expected a CT; give the CT first, then its labels"
+        ):
+            import_request(paths / "kidney.stl", [paths / "ct"])
 
 
 class TestIdentifiers:

@@ -15,6 +15,7 @@ from pydicom.uid import (
     JPEGLSLossless,
     RLELossless,
 )
+from skimage.draw import polygon
 from synthetic_body import DIRECTIONS
 from test_readers_labels import by_name, ct_grid, ring
 
@@ -138,6 +139,23 @@ class TestStructures:
         assert filled["Kidney"].values.any(axis=(1, 2)).sum() == 2
         planes = near.any(axis=(1, 2)).sum()
         assert [("contours", 2), ("contours", planes)] == [one for one in shown if one[0] == "contours"]
+
+    @pytest.mark.parametrize("corners", [3, 4, 60, 500])
+    def test_any_polygon(self, tmp_path, corners):
+        """Strips or not: as skimage fills the whole polygon, also where it crosses itself and has corners and edges on pixels."""
+        series = Series(tmp_path / "ct", DIRECTIONS["identity"], size=(70, 60, 4), origin=(0, 0, 0))
+        series.spacing = (1.0, 1.0)
+        drawn = np.random.default_rng(corners).integers(-8, 75, (3, corners, 2))
+        contours = [np.column_stack([each, np.full(corners, 2.5 * k)]) for k, each in enumerate(drawn)]
+        path = write_structures(tmp_path / "rt.dcm", {"Kidney": contours})
+        (filled,) = open_labels(path).maps(ct_grid(series))
+        expected = np.zeros((3, 200, 200), bool)
+        for plane, each in zip(expected, drawn, strict=True):
+            plane[polygon(each[:, 1] + 50, each[:, 0] + 50, plane.shape)] = True
+        found = np.zeros_like(expected)
+        at = np.rint(filled.grid.place(np.argwhere(filled.values)[:, ::-1]) / (1, 1, 2.5)).astype(int)
+        found[at[:, 2], at[:, 1] + 50, at[:, 0] + 50] = True
+        assert np.array_equal(found, expected)
 
     def test_without_a_kidney_all_is_filled(self, series, tmp_path):
         path = write_structures(tmp_path / "rt.dcm", {"x": self.circles(series, range(6))})

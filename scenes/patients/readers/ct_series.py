@@ -139,10 +139,7 @@ def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
     """
     items = find_dicom_files(path)
     if not items and path.name.lower().endswith(SURFACE_ENDINGS):
-        raise PatientError(
-            f"{path}: is a surface; expected a CT or labels in voxels; convert it to a segmentation, for example in 3D Slicer, and save "
-            "that as .seg.nrrd"
-        )
+        raise PatientError(f"{path}: is a surface; expected a CT; give the CT first, then its labels")
     if not items and path.is_file():
         raise PatientError(
             f"{path}: unknown kind of file; expected DICOM (a folder, a DICOMDIR or a zip archive), or a file that ends in "

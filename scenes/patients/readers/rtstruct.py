@@ -24,6 +24,7 @@ from scenes.volumes.voxel_grid import Box, VoxelGrid
 # Largest deviation of a contour from the even planes, as a share of their distance.
 OFF_PLANE = 0.3
 MOST_POINTS = 20_000_000
+STRIP_ROWS = 16
 # Values of RTROIInterpretedType that are no tissue.
 NO_TISSUE = {"EXTERNAL", "SUPPORT", "FIXATION", "BOLUS"}
 
@@ -178,9 +179,23 @@ def _filled(
     grid = VoxelGrid(size, ct.spacing * (1, 1, step), origin, ct.direction).checked(name)
     inside = np.zeros(size[::-1], bool)
     for place, number in progress(list(zip(places, numbers, strict=True)), "contours"):
-        rows, columns = polygon(place[:, 1] - low[1], place[:, 0] - low[0], inside.shape[1:])
-        inside[number, rows, columns] ^= True
+        _toggle(inside[number], place[:, 1::-1] - low[::-1])
     return grid, inside
+
+
+def _toggle(plane: np.ndarray, corners: np.ndarray) -> None:
+    """Invert the pixels (rows, columns) in and on a polygon with corners (n, 2).
+
+    Strip by strip, as each pixel is compared with each corner: of those above a strip, or below it, only the first and last of a
+    row of them count.
+    """
+    for start in range(0, len(plane), STRIP_ROWS):
+        strip = plane[start : start + STRIP_ROWS]
+        side = (corners[:, 0] > start + len(strip)) - 1 * (corners[:, 0] < start - 1)
+        between = (side != 0) & (side == np.roll(side, 1)) & (side == np.roll(side, -1))
+        part = corners[~between]
+        if len(part):
+            strip[polygon(part[:, 0] - start, part[:, 1], strip.shape)] ^= True
 
 
 def _planes(name: str, heights: np.ndarray) -> tuple[float, np.ndarray]:
