@@ -385,6 +385,19 @@ class TestSearch:
         with pytest.raises(PatientError, match=r"check\.png would have contained"):
             save_patient(taken_in[0], tmp_path / "p", draw=draw, identifiers={"Özgür Ünal": "PatientName"})
 
+    @pytest.mark.parametrize("encoding", ["ascii", "utf-16-le"])
+    @pytest.mark.parametrize("around", [b"\0", b"7", b"7\0", b"A", b"."])
+    def test_uids_between_other_bytes(self, taken_in, tmp_path, encoding, around):
+        def draw(folder):
+            (folder / "check.png").write_bytes(around + "1.2.826.0.17".encode(encoding) + around)
+
+        for uid, is_there in (("1.2.826.0.17", True), ("1.2.826.0.19", False)):
+            try:
+                save_patient(taken_in[0], tmp_path / uid, draw=draw, identifiers={uid: "a UID"})
+                assert not is_there
+            except PatientError:
+                assert is_there
+
     def test_packed_voxels_are_searched(self, taken_in, tmp_path):
         def draw(folder):
             words = sitk.GetImageFromArray(np.frombuffer(b"\0\0of Doe^Jane\0", np.uint8).reshape(1, 1, -1))

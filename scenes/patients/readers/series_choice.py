@@ -54,9 +54,10 @@ def choose_series(
     if len({patients[s] for s in theirs}) > 1:
         named = any(s.patient for s in candidates)
         what = f"CTs of {count} patients" if named else f"CTs of {count} studies, and no patient ID"
+        unsure = ", and the labels do not show which" if grid or labels != NO_REFERENCES else ""
         raise PatientError(
-            f"{path}: {what}: {listed_series(candidates)}; expected one patient, and the labels do not show which; choose a series with "
-            "--series, or give the folder of one patient"
+            f"{path}: {what}: {listed_series(candidates)}; expected one patient{unsure}; choose a series with --series, or give the "
+            "folder of one patient"
         )
     why = [REASONS[surest]] * (len(theirs) < len(ranked))
     if len(theirs) > 1:
