@@ -4,7 +4,7 @@ import numpy as np
 from scipy import ndimage
 
 from scenes.patients.organ_selection import BODY_ABOVE_HU, Organ
-from scenes.patients.readers.label_maps import LabelMap, listed
+from scenes.patients.readers.label_maps import LabelMap, among, box_of, listed
 from scenes.volumes.voxel_grid import VoxelGrid
 
 BONE_ABOVE_HU = 300
@@ -34,7 +34,7 @@ def orientation_warnings(
             "the bones are in front of the body's centre, not behind it; the CT may be turned over; compare check.png "
             "with the patient"
         )
-    liver = np.isin(labels.values, labels.of_tissues("liver"))
+    liver = among(labels.values, labels.of_tissues("liver"))
     if midline is not None and liver.any():
         step = max(1, int(COARSE_MM / labels.grid.spacing.min()))
         places = labels.grid.place(np.argwhere(liver[::step, ::step, ::step])[:, ::-1] * step)
@@ -62,8 +62,10 @@ def fat_warnings(
 
     Of the organ (z, y, x) only the parenchyma counts: a tumour may contain fat.
     """
-    depth = ndimage.distance_transform_edt(organ, sampling=grid.spacing[::-1])
-    rim = hounsfield[parenchyma & (depth <= SHELL_MM)]
+    # A voxel beyond the organ's box is farther than one at its side.
+    box = tuple(slice(max(0, a.start - 1), a.stop + 1) for a in box_of(organ)[::-1]) if organ.any() else ()
+    depth = ndimage.distance_transform_edt(organ[box], sampling=grid.spacing[::-1])
+    rim = hounsfield[box][parenchyma[box] & (depth <= SHELL_MM)]
     share = float((rim < FAT_BELOW_HU).mean()) if len(rim) else 0.0
     if share <= MOST_FAT:
         return ()

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import ndimage
 
 from errors import PatientError
-from scenes.patients.readers.label_maps import LabelMap, box_of, listed
+from scenes.patients.readers.label_maps import LabelMap, among, box_of, listed
 from scenes.patients.readers.segment_names import Side
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -61,7 +61,7 @@ def find_organs(labels: LabelMap, organ: Sequence[int] | None = None) -> list[Or
     """
     own = _organ_values(labels, organ)
     lesions = [value for value in labels.of_tissues(*LESIONS) if value not in own]
-    wanted = np.isin(labels.values, own + lesions)
+    wanted = among(labels.values, own + lesions)
     if not wanted.any():
         raise PatientError(f"the labels contain no voxel of an organ: {labels.listed()}; choose other labels")
     box = box_of(wanted)

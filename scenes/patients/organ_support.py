@@ -15,7 +15,7 @@ from skimage.measure import marching_cubes
 
 from errors import PatientError
 from scenes.patients.label_surfaces import FACES, decimate
-from scenes.patients.readers.label_maps import LabelMap, resample_nearest
+from scenes.patients.readers.label_maps import LabelMap, among, resample_nearest
 from scenes.surfaces import in_lps, load_surface, signed_distance_from, stated_space
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -110,7 +110,7 @@ def bed_of_labels(
     size = len(grid[0]), len(grid[1]), len(grid[2])
     start = np.array([axis[0] for axis in grid])
     onto = VoxelGrid(size, np.full(3, GRID_MM), frame.T @ start, frame.T)
-    solid = ~np.isin(labels.values, [0, *own])
+    solid = ~among(labels.values, [0, *own])
     tissue = resample_nearest(labels.grid, solid, onto).transpose(2, 1, 0)
 
     swept = gap < 0

@@ -252,6 +252,14 @@ def present_values(values: np.ndarray) -> list[int]:
     return [int(v) for v in np.flatnonzero(there) if v]
 
 
+def among(voxels: np.ndarray, wanted: Sequence[int]) -> np.ndarray:
+    """Whether each voxel has one of the wanted values; plane by plane, as np.isin takes three times the memory."""
+    found = np.empty(voxels.shape, bool)
+    for plane, inside in zip(voxels, found, strict=True):
+        inside[:] = np.isin(plane, wanted)
+    return found
+
+
 def box_of(inside: np.ndarray) -> Box:
     """The box (x, y, z) around non-zero voxels (z, y, x), of which there is one or more."""
     z, y, x = ndimage.find_objects(np.asarray(inside, bool).view(np.uint8))[0]
