@@ -103,8 +103,8 @@ class VoxelGrid:
         """The smallest box of voxels that covers an LPS box [mm] between two corners; it may be empty."""
         corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(3, -1).T
         found = self.index(corners)
-        first = np.clip(np.floor(found.min(axis=0)).astype(int), 0, self.size)
-        last = np.clip(np.ceil(found.max(axis=0)).astype(int) + 1, 0, self.size)
+        first = np.clip(np.floor(found.min(axis=0)), 0, self.size)
+        last = np.clip(np.ceil(found.max(axis=0)) + 1, 0, self.size)
         x, y, z = (slice(int(a), int(max(a, b))) for a, b in zip(first, last, strict=True))
         return x, y, z
 
