@@ -78,16 +78,17 @@ def list_ct(path: Path, progress: Progress = silent) -> CtListing:
     if path.is_file() and is_volume_file(path):
         return CtListing([_row_of_file(file_volume(path))], [])
     found, volumes = read_dicom_headers(path, progress), volume_files(path)
-    if volumes and not found.candidates and not found.labels:
-        return CtListing([_row_of_file(only_volume(path, volumes))], [])
-    candidates = in_order(found.candidates if found.labels else ct_candidates(path, found))
+    files = [_row_of_file(only_volume(path, volumes))] if volumes and not found.candidates else []
+    candidates = in_order(found.candidates if found.labels or files else ct_candidates(path, found))
     patients = patient_numbers(candidates)
     numbers = [s.number for s in candidates]
     rows = [
         _row_of_series(path, s, patient, numbers.count(s.number) > 1)
         for s, patient in zip(candidates, patients, strict=True)
     ]
-    return CtListing(rows, [_row_of_labels(kind, item, candidates, patients) for kind, item in found.labels])
+    return CtListing(
+        files + rows, [_row_of_labels(kind, item, candidates, patients) for kind, item in found.labels]
+    )
 
 
 def open_ct(
