@@ -176,7 +176,7 @@ def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume
         notes.append(f"left out, localisers: {series.localizers + left_out}")
     if not all(one.is_rescaled for one in slices):
         notes.append("the files have no rescale: their values were taken as HU")
-    positions = {one.patient_position for one in slices}
+    positions = {one.patient_position for one in slices} - {""}
     if len(positions) > 1:
         notes.append("the slices have different PatientPositions: none was taken")
     stack = stack_slices(str(path), slices, lambda files: progress(files, "slices"))
@@ -184,7 +184,7 @@ def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume
         stack,
         notes=(*notes, *stack.notes),
         references=series.references,
-        series=series.number,
+        series=series.number if series.number.isdecimal() else "",
         patient_position=positions.pop() if len(positions) == 1 else "",
         identifiers=identifiers_of(slices[0].item),
     )
