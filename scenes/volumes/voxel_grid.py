@@ -77,6 +77,11 @@ class VoxelGrid:
         """Voxel indices (n, 3), with fractions, of places in LPS [mm]."""
         return (np.asarray(places) - self.origin) @ self.direction / self.spacing
 
+    def share_inside(self, places: npt.ArrayLike) -> float:
+        """Share of places (n, 3) in LPS [mm] that are in a voxel of this grid."""
+        found = self.index(places)
+        return float(((found >= -0.5) & (found <= np.array(self.size) - 0.5)).all(axis=1).mean())
+
     def corners(self, box: Box | None = None) -> np.ndarray:
         """LPS [mm] of the eight outermost voxel centres (8, 3) of the grid or of a box."""
         box = box or self.full_box()

@@ -22,6 +22,7 @@ from scenes.patients.readers.series_choice import (
 )
 from scenes.patients.readers.slice_stack import stack_slices
 from scenes.patients.readers.volume_folder import only_volume, volume_files
+from scenes.surfaces import OTHER_ENDINGS, is_surface_file
 from scenes.terminal import Progress, silent
 from scenes.volumes.dicom_references import NO_REFERENCES, DicomReferences
 from scenes.volumes.lazy_volume import LazyVolume
@@ -30,7 +31,6 @@ from scenes.volumes.voxel_grid import VoxelGrid
 
 # Up to this share of slices in another view are taken for unmarked localizers.
 STRAY = 0.1
-SURFACE_ENDINGS = (".stl", ".ply", ".obj", ".vtk", ".vtp")
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
     volumes.
     """
     items = find_dicom_files(path)
-    if not items and path.name.lower().endswith(SURFACE_ENDINGS):
+    if not items and (is_surface_file(path) or path.suffix.lower() in OTHER_ENDINGS):
         raise PatientError(f"{path}: is a surface; expected a CT; give the CT first, then its labels")
     if not items and path.is_file():
         raise PatientError(

@@ -117,7 +117,7 @@ def _check_place(file: Path, surface: trimesh.Trimesh, space: Space | None, ct: 
     """Raises PatientError where a surface is outside the CT, but inside it in the other coordinate system."""
     other: Space = "LPS" if space == "RAS" else "RAS"
     here, there = (
-        _share_in(ct, vertices) for vertices in (surface.vertices, surface.vertices * (-1.0, -1.0, 1.0))
+        ct.share_inside(vertices) for vertices in (surface.vertices, surface.vertices * (-1.0, -1.0, 1.0))
     )
     if here < LEAST_IN_CT < there:
         stated = "as it states" if space else "as was assumed"
@@ -125,11 +125,6 @@ def _check_place(file: Path, surface: trimesh.Trimesh, space: Space | None, ct: 
             f"{file}: has {here:.0%} of its surface in the CT as {space or 'LPS'}, {stated}, and {there:.0%} as {other}; export it again "
             f"with the right coordinate system, or write SPACE={other} into its header"
         )
-
-
-def _share_in(grid: VoxelGrid, places: np.ndarray) -> float:
-    found = grid.index(places)
-    return float(((found >= -0.5) & (found <= np.array(grid.size) - 0.5)).all(axis=1).mean())
 
 
 def _grid_of(surface: trimesh.Trimesh, low: np.ndarray, high: np.ndarray) -> VoxelGrid | None:
