@@ -36,6 +36,7 @@ from render.keys import Keys
 from render.viewer import Controls, ScannerSettings, Settings, View
 from render.window import Window
 from scenes.import_findings import acknowledge
+from scenes.scene import SceneError
 from ultrasound.doppler import scale_colours
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane
@@ -312,9 +313,9 @@ class WindowFrames(Frames[WindowInput]):
         )
 
     def import_warnings(self) -> tuple[str, ...]:
-        """The warnings of the import, and the key that acknowledges them."""
+        """The key that acknowledges the warnings of the import, and these: of many, the last are not shown."""
         shown = super().import_warnings()
-        return (*shown, self.keys.worded(HOW_TO_ACKNOWLEDGE)) if shown else ()
+        return (self.keys.worded(HOW_TO_ACKNOWLEDGE), *shown) if shown else ()
 
     def _record_sweep(self, probe: Probe, view: View, controls: Controls) -> None:
         if not self.frozen:
@@ -380,12 +381,13 @@ class WindowFrames(Frames[WindowInput]):
         """Write files that the user asked for."""
         try:
             write()
-        except OSError as error:
-            self.notices.post(f"Not saved: {error.strerror}", in_terminal=False)
+        except (OSError, SceneError) as error:
+            reason = error.strerror if isinstance(error, OSError) else str(error)
+            self.notices.post(f"Not saved: {reason}", in_terminal=False)
 
     def _acknowledge(self) -> None:
-        """Mark the warnings of the import as checked. Raises OSError."""
-        acknowledge(self.folder)
+        """Mark the warnings of the import as checked. Raises OSError, SceneError."""
+        acknowledge(self.folder, self.warnings)
         self.warnings = ()
         self.notices.post("warnings of the import acknowledged")
 

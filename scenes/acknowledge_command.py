@@ -27,5 +27,5 @@ def acknowledge_command(patient: Path, yes: bool) -> None:
         click.echo(f"WARNING of the import: {text}")
     if not yes:
         click.confirm(f"Did you check this in {folder / 'check.png'}?", abort=True)
-    acknowledge(folder)
+    acknowledge(folder, findings.open_warnings)
     click.echo("Acknowledged: no longer shown.")

@@ -1,5 +1,6 @@
 """The findings of an import: ``import.json`` in a patient's folder. Its warnings are shown until the user acknowledges them."""
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Literal
 
@@ -97,11 +98,17 @@ def open_warnings(scene: Scene, folder: Path) -> tuple[str, ...]:
     return () if findings is None else findings.open_warnings
 
 
-def acknowledge(folder: Path) -> None:
-    """Mark all warnings of a patient's folder as acknowledged. Raises SceneError, OSError."""
+def acknowledge(folder: Path, shown: Collection[str]) -> None:
+    """Mark the warnings of a patient's folder that were shown as acknowledged: since then the patient may have been imported again.
+
+    Raises SceneError, OSError.
+    """
     findings = read_findings(folder)
     if findings is not None:
-        checked = tuple(each.model_copy(update=dict(acknowledged=True)) for each in findings.warnings)
+        checked = tuple(
+            each.model_copy(update=dict(acknowledged=each.acknowledged or each.text in shown))
+            for each in findings.warnings
+        )
         with atomic_write(folder / FINDINGS_FILE) as partial:
             partial.write_text(findings_text(findings.model_copy(update=dict(warnings=checked))), "utf-8")
 

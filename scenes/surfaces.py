@@ -19,6 +19,8 @@ SPACE_FIELD = re.compile(r"\bSPACE ?= ?([\w-]+)")
 Space = Literal["LPS", "RAS"]
 STL_HEADER_BYTES = 80
 ENDINGS = (".stl", ".ply", ".obj")
+# Of surfaces that no installed library reads.
+OTHER_ENDINGS = (".vtk", ".vtp", ".vtu", ".3mf", ".fbx")
 MOST_BYTES, MOST_COMMENT_BYTES = 1 << 29, 1 << 16
 EXPECTED = "a closed surface in an STL, PLY or OBJ file, in mm"
 

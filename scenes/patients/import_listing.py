@@ -85,7 +85,9 @@ def _dicom_labels(path: Path, progress: Progress) -> str:
 
 
 def _segment_rows(one: LabelMap) -> list[tuple]:
-    counts = np.bincount(one.values.ravel(), minlength=1 + max(one.segments))
+    counts = np.zeros(1 + max(one.segments), int)
+    for plane in one.values:  # of a whole volume, bincount takes eight bytes a voxel
+        counts += np.bincount(plane.ravel(), minlength=len(counts))
     return [
         (segment.value, segment.name, segment.tissue, segment.side, counts[value] * one.grid.voxel_ml)
         for value, segment in one.segments.items()

@@ -11,7 +11,7 @@ from errors import PatientError
 from scenes.patients.patient_import import Patient, import_patient
 from scenes.patients.patient_position import Position
 from scenes.patients.readers.ct_series import ct_candidates, open_ct, read_dicom_headers
-from scenes.patients.readers.dicom_headers import DicomContents
+from scenes.patients.readers.dicom_headers import DicomContents, Series
 from scenes.patients.readers.label_files import Segmentation, open_labels, segmentation_of
 from scenes.patients.readers.label_maps import absent_labels, assign_tissues, merge_label_maps
 from scenes.patients.readers.segment_names import Side
@@ -109,7 +109,9 @@ def _segmentations(
     progress: Progress,
 ) -> list[Segmentation]:
     """The segmentations of the paths, else the one among the DICOM files of the CT."""
-    candidates = [] if contents is None or volume_files(ct) else ct_candidates(ct, contents)
+    candidates: list[Series] = []
+    if contents is not None and (contents.candidates or not volume_files(ct)):
+        candidates = ct_candidates(ct, contents)
     if series is not None and candidates:
         candidates = [choose_series(ct, candidates, series)[0]]
     own = [one.references for one in candidates]

@@ -1,12 +1,14 @@
 """Write a patient's folder, and search its files for identifiers of the patient (PHI)."""
 
+import json
 import re
 import zlib
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import SimpleITK as sitk
 
@@ -30,7 +32,7 @@ ENCODINGS = ("utf-8", "utf-16-le", "latin-1")
 UID = re.compile(r"[0-9.]+")
 NUMBERS = re.compile(rb"(?:[0-9.]\0?){4,}")
 GZIP = 31  # zlib's wbits for gzip
-COMMON = "left right kidney cyst vessels collecting system STL LPS ITK NRRD complete type int short unsigned char gzip space mm ml HU CT"
+COMMON = "supine prone decubitus low moderate high left right kidney cyst vessels collecting system STL LPS ITK NRRD complete type int short unsigned char gzip space mm ml HU CT"
 
 
 def save_patient(
@@ -102,7 +104,11 @@ def without_identifiers(patient: Patient, identifiers: Collection[str]) -> Patie
 
 def redacted(text: str, identifiers: Collection[str]) -> str:
     """A text without the identifiers: in notes and warnings, which may quote names of files and labels."""
-    for identifier in filter(is_identifying, identifiers):
+    # Labels name the UIDs of a thousand slices: few are in the text, and to compile a pattern for each takes seconds.
+    plain = text.casefold()
+    found = [each for each in identifiers if each.casefold() in plain and is_identifying(each)]
+    # The longest first: one may begin with another.
+    for identifier in sorted(found, key=len, reverse=True):
         is_sure = len(identifier) >= SURE_BYTES and not identifier.isdigit()
         pattern = re.escape(identifier) if is_sure else _as_word(re.escape(identifier))
         text = re.sub(pattern, REDACTED, text, flags=re.IGNORECASE)
@@ -147,7 +153,19 @@ def _contents(file: Path) -> tuple[bytes, bytes]:
     if file.suffix == ".nrrd":
         header, _, packed = content.partition(b"\n\n")
         return header, header + zlib.decompress(packed, wbits=GZIP)
+    if file.suffix == ".json":
+        # Not the keys, which are the program's words; and texts as they are, without JSON's escapes.
+        content = "\n".join(_texts_in(json.loads(content))).encode()
     return (content if file.suffix in (".toml", ".json") else content[:STL_HEADER_BYTES]), content
+
+
+def _texts_in(value: Any) -> Iterator[str]:
+    """All texts in a value of JSON, without the keys."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, list | dict):
+        for each in value.values() if isinstance(value, dict) else value:
+            yield from _texts_in(each)
 
 
 def _holds(words: bytes, everything: bytes, text: str) -> bool:

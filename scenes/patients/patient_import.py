@@ -219,8 +219,7 @@ def _overview(grid: VoxelGrid, hounsfield: np.ndarray) -> sitk.Image:
 def _overlap(grid: VoxelGrid, piece: Organ) -> float:
     """Share of an organ's voxels within a grid."""
     indices = np.argwhere(piece.mask)[:, ::-1]
-    found = grid.index(piece.grid.place(indices[:: max(1, len(indices) // 200_000)]))
-    return float(((found >= -0.5) & (found <= np.array(grid.size) - 0.5)).all(axis=1).mean())
+    return grid.share_inside(piece.grid.place(indices[:: max(1, len(indices) // 200_000)]))
 
 
 def _check_complete(grid: VoxelGrid, piece: Organ) -> None:

@@ -77,6 +77,11 @@ class VoxelGrid:
         """Voxel indices (n, 3), with fractions, of places in LPS [mm]."""
         return (np.asarray(places) - self.origin) @ self.direction / self.spacing
 
+    def share_inside(self, places: npt.ArrayLike) -> float:
+        """Share of places (n, 3) in LPS [mm] that are in a voxel of this grid."""
+        found = self.index(places)
+        return float(((found >= -0.5) & (found <= np.array(self.size) - 0.5)).all(axis=1).mean())
+
     def corners(self, box: Box | None = None) -> np.ndarray:
         """LPS [mm] of the eight outermost voxel centres (8, 3) of the grid or of a box."""
         box = box or self.full_box()
@@ -103,8 +108,8 @@ class VoxelGrid:
         """The smallest box of voxels that covers an LPS box [mm] between two corners; it may be empty."""
         corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(3, -1).T
         found = self.index(corners)
-        first = np.clip(np.floor(found.min(axis=0)).astype(int), 0, self.size)
-        last = np.clip(np.ceil(found.max(axis=0)).astype(int) + 1, 0, self.size)
+        first = np.clip(np.floor(found.min(axis=0)), 0, self.size)
+        last = np.clip(np.ceil(found.max(axis=0)) + 1, 0, self.size)
         x, y, z = (slice(int(a), int(max(a, b))) for a, b in zip(first, last, strict=True))
         return x, y, z
 

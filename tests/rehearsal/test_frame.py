@@ -24,7 +24,7 @@ from rehearsal.resection.resection_state import NO_RESECTION
 from render.keys import DEFAULT_KEYS, Keys
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
-from scenes.scene import EMBEDDED, load_scene
+from scenes.scene import EMBEDDED, SceneError, load_scene
 from scenes.terminal import shell_command
 from ultrasound.probe import load_probe
 
@@ -220,24 +220,25 @@ def test_a_restored_state_is_a_notice_and_stands_in_the_panel_for_a_while(loopin
 
 def test_warnings_of_the_import_stay_until_they_are_acknowledged(looping, monkeypatch, capsys):
     marked = []
-    monkeypatch.setattr(frame, "acknowledge", marked.append)
+    monkeypatch.setattr(frame, "acknowledge", lambda *what: marked.append(what))
     looping.warnings, looping.folder = ("12 % of the rim is fat",), looping.out / "patient"
     for _ in range(2):
         assert next_view(looping, Controls(Settings())).warnings == (
-            "Import: 12 % of the rim is fat",
             "Shift+I: I have checked this in check.png",
+            "Import: 12 % of the rim is fat",
         )
     assert marked == []
     after = next_view(looping, Controls(Settings(), acknowledge=True))
-    assert after.warnings == () and marked == [looping.folder]
+    assert after.warnings == () and marked == [(looping.folder, ("12 % of the rim is fat",))]
     assert "acknowledged" in after.status and "acknowledged" in capsys.readouterr().out
     next_view(looping, Controls(Settings(), acknowledge=True))
     assert len(marked) == 1
 
 
-def test_warnings_that_cannot_be_acknowledged_stay(looping, monkeypatch):
-    def refuse(folder):
-        raise OSError(30, "Read-only file system")
+@pytest.mark.parametrize("error", [OSError(30, "Read-only file system"), SceneError("Read-only: damaged")])
+def test_warnings_that_cannot_be_acknowledged_stay(looping, monkeypatch, error):
+    def refuse(folder, shown):
+        raise error
 
     monkeypatch.setattr(frame, "acknowledge", refuse)
     looping.warnings = ("a warning",)

@@ -50,7 +50,7 @@ def test_warnings_are_open_until_they_are_acknowledged(folder):
     assert open_warnings(files_scene(), folder) == TEXTS
     assert open_warnings(Scene(anatomy=AnatomyFiles(phantom=True)), folder) == ()
     before = read_findings(folder)
-    acknowledge(folder)
+    acknowledge(folder, TEXTS)
     assert open_warnings(files_scene(), folder) == ()
     after = read_findings(folder)
     # Nothing else has changed, and no other file is left.
@@ -59,9 +59,15 @@ def test_warnings_are_open_until_they_are_acknowledged(folder):
     assert not list(folder.glob(".*"))
 
 
+def test_a_warning_that_was_not_shown_stays_open(folder):
+    acknowledge(folder, ["another import's", TEXTS[0]])
+    acknowledge(folder, [])
+    assert open_warnings(files_scene(), folder) == TEXTS[1:]
+
+
 def test_a_folder_without_findings_has_no_warnings(tmp_path):
     assert read_findings(tmp_path) is None and open_warnings(files_scene(), tmp_path) == ()
-    acknowledge(tmp_path)
+    acknowledge(tmp_path, TEXTS)
     assert warning_lines((), tmp_path) == [] and list(tmp_path.iterdir()) == []
 
 
@@ -102,6 +108,6 @@ def test_commands_that_use_the_patient_repeat_them(folder, tmp_path, capfd):
     assert main(["export", str(folder), "--out", str(tmp_path / "out")]) == 0
     printed = capfd.readouterr().out
     assert f"WARNING of the import: {TEXTS[0]}\n" in printed and f"acknowledge {folder}" in printed
-    acknowledge(folder)
+    acknowledge(folder, TEXTS)
     assert main(["export", str(folder), "--out", str(tmp_path / "again")]) == 0
     assert "WARNING" not in capfd.readouterr().out

@@ -48,6 +48,15 @@ def test_labels_of_one_file_per_organ(tmp_path, capfd):
     ]
 
 
+def test_a_volume_file_beside_dicom_labels_is_the_ct(tmp_path, capfd):
+    series = Series(tmp_path / "elsewhere")
+    write_segmentation(tmp_path / "case" / "seg.dcm", series, {"Kidney": np.ones(series.size[::-1])})
+    nibabel.save(nibabel.Nifti1Image(np.ones((10, 10, 10)), np.eye(4)), tmp_path / "case" / "ct.nii.gz")
+    assert main(["import", str(tmp_path / "case"), "--list"]) == 0
+    printed = capfd.readouterr().out
+    assert ["file", "10"] in [each[:2] for each in words(printed)] and "seg.dcm: Kidney" in printed
+
+
 def test_a_path_without_anything_is_refused_in_words(tmp_path, capfd):
     assert main(["import", str(tmp_path), "--list"]) == 2
     assert "no DICOM file found" in capfd.readouterr().err

@@ -313,6 +313,9 @@ class TestLabelsBesideTheCt:
         assert requested(tmp_path / "in", organ=[f"Kidney {n}"], series=str(n)).grid.size == pair[n - 1].size
         with pytest.raises(PatientError, match="2 segmentations and structure sets of 2 patients.*--series"):
             import_request(tmp_path / "in")
+        # Another file in the folder changes nothing.
+        sitk.WriteImage(ct_grid(pair[0]).image(pair[0].hounsfield), str(tmp_path / "in" / "copy.nii.gz"))
+        assert requested(tmp_path / "in", organ=[f"Kidney {n}"], series=str(n)).grid.size == pair[n - 1].size
 
     @pytest.mark.parametrize("n", [1, 2])
     def test_two_patients_in_a_folder_of_labels(self, pair, tmp_path, requested, n):

@@ -58,6 +58,12 @@ class TestHeader:
     def test_absent(self, tmp_path):
         assert open_ct(Series(tmp_path).write()).patient_position == ""
 
+    def test_slices_without_one_do_not_count(self, tmp_path):
+        series = Series(tmp_path)
+        series.write(edit=lambda data, k: setattr(data, "PatientPosition", "HFP" if k else ""))
+        volume = open_ct(tmp_path)
+        assert volume.patient_position == "HFP" and volume.notes == ()
+
     def test_slices_that_disagree(self, tmp_path):
         series = Series(tmp_path)
         series.write(edit=lambda data, k: setattr(data, "PatientPosition", "HFS" if k else "HFP"))

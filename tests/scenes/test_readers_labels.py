@@ -119,8 +119,18 @@ class TestNames:
             "vertebrae_L1",
             "spleen",
         ]
-        near += ["iliopsoas_left", "aorta", "colon", "renal_lesion", "autochthon_right", "stomach"]
+        near += [
+            "kidney_left_surface",
+            "Interface",
+            "iliopsoas_left",
+            "aorta",
+            "colon",
+            "renal_lesion",
+            "autochthon_right",
+            "stomach",
+        ]
         far = [
+            "face",
             "brain",
             "heart",
             "lung_upper_lobe_left",

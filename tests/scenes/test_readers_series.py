@@ -201,6 +201,11 @@ class TestChoice:
         Series(tmp_path, number=1, size=(12, 10, 20), gap=0.625).write()
         assert_whole(tall, tmp_path)
 
+    def test_without_a_number(self, tmp_path):
+        """It is empty in the findings."""
+        assert read_ct(Series(tmp_path / "a").write(SeriesNumber=None))[0].series == ""
+        assert read_ct(Series(tmp_path / "b", number=12).write())[0].series == "12"
+
     def test_a_number_is_no_end_of_a_uid(self, tmp_path):
         one, other = Series(tmp_path, number=8), Series(tmp_path, number=3)
         other.uid = "1.2.826.0.1.3680043.8"

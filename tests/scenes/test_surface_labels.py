@@ -9,6 +9,7 @@ from synthetic_body import DIRECTIONS, LEFT, TUMOUR, grid_around
 
 from scenes.patients.import_request import import_request
 from scenes.patients.organ_support import bed_of_file
+from scenes.patients.readers import surface_labels
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import merge_label_maps
 from scenes.surfaces import save_surface
@@ -135,6 +136,21 @@ def test_bodies_in_one_file(tmp_path, surface, share):
     path = written(tmp_path / "tumour.stl", surface)
     two = share == 2.0
     assert_is(path, share * ball().volume, TUMOUR[0] + [12.5 * two, 0, 0])
+
+
+def test_the_box_of_a_long_thin_structure_has_a_limit_of_voxels(tmp_path, monkeypatch):
+    """Of two balls far apart, so that their box is large for their volume."""
+    written(
+        tmp_path / "vessels.stl", together(ball(), ellipsoid(TUMOUR[0] + [60, 60, 60], np.full(3, RADIUS)))
+    )
+    most = 200_000
+    monkeypatch.setattr(surface_labels, "MOST_VOXELS", most)
+    (found,) = open_labels(tmp_path / "vessels.stl").maps(THICK)
+    # A voxel more along each axis.
+    assert (
+        0.9 * most < np.prod(np.array(found.grid.size) + 1) and np.prod(np.array(found.grid.size) - 1) < most
+    )
+    assert measured(found)[0] == pytest.approx(2 * 4 / 3 * np.pi * RADIUS**3, rel=0.02)
 
 
 def without(surface, faces):

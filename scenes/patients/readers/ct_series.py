@@ -22,6 +22,7 @@ from scenes.patients.readers.series_choice import (
 )
 from scenes.patients.readers.slice_stack import stack_slices
 from scenes.patients.readers.volume_folder import only_volume, volume_files
+from scenes.surfaces import OTHER_ENDINGS, is_surface_file
 from scenes.terminal import Progress, silent
 from scenes.volumes.dicom_references import NO_REFERENCES, DicomReferences
 from scenes.volumes.lazy_volume import LazyVolume
@@ -30,7 +31,6 @@ from scenes.volumes.voxel_grid import VoxelGrid
 
 # Up to this share of slices in another view are taken for unmarked localizers.
 STRAY = 0.1
-SURFACE_ENDINGS = (".stl", ".ply", ".obj", ".vtk", ".vtp")
 
 
 @dataclass(frozen=True)
@@ -78,16 +78,17 @@ def list_ct(path: Path, progress: Progress = silent) -> CtListing:
     if path.is_file() and is_volume_file(path):
         return CtListing([_row_of_file(file_volume(path))], [])
     found, volumes = read_dicom_headers(path, progress), volume_files(path)
-    if volumes and not found.candidates and not found.labels:
-        return CtListing([_row_of_file(only_volume(path, volumes))], [])
-    candidates = in_order(found.candidates if found.labels else ct_candidates(path, found))
+    files = [_row_of_file(only_volume(path, volumes))] if volumes and not found.candidates else []
+    candidates = in_order(found.candidates if found.labels or files else ct_candidates(path, found))
     patients = patient_numbers(candidates)
     numbers = [s.number for s in candidates]
     rows = [
         _row_of_series(path, s, patient, numbers.count(s.number) > 1)
         for s, patient in zip(candidates, patients, strict=True)
     ]
-    return CtListing(rows, [_row_of_labels(kind, item, candidates, patients) for kind, item in found.labels])
+    return CtListing(
+        files + rows, [_row_of_labels(kind, item, candidates, patients) for kind, item in found.labels]
+    )
 
 
 def open_ct(
@@ -138,7 +139,7 @@ def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
     volumes.
     """
     items = find_dicom_files(path)
-    if not items and path.name.lower().endswith(SURFACE_ENDINGS):
+    if not items and (is_surface_file(path) or path.suffix.lower() in OTHER_ENDINGS):
         raise PatientError(f"{path}: is a surface; expected a CT; give the CT first, then its labels")
     if not items and path.is_file():
         raise PatientError(
@@ -175,7 +176,7 @@ def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume
         notes.append(f"left out, localisers: {series.localizers + left_out}")
     if not all(one.is_rescaled for one in slices):
         notes.append("the files have no rescale: their values were taken as HU")
-    positions = {one.patient_position for one in slices}
+    positions = {one.patient_position for one in slices} - {""}
     if len(positions) > 1:
         notes.append("the slices have different PatientPositions: none was taken")
     stack = stack_slices(str(path), slices, lambda files: progress(files, "slices"))
@@ -183,7 +184,7 @@ def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume
         stack,
         notes=(*notes, *stack.notes),
         references=series.references,
-        series=series.number,
+        series=series.number if series.number.isdecimal() else "",
         patient_position=positions.pop() if len(positions) == 1 else "",
         identifiers=identifiers_of(slices[0].item),
     )

@@ -25,14 +25,12 @@ from scenes.patients.readers.segment_codes import slicer_meaning
 from scenes.patients.readers.segment_names import is_far, side_of, tissue_of
 from scenes.patients.readers.surface_labels import read_surfaces
 from scenes.surfaces import ENDINGS as SURFACE_ENDINGS
-from scenes.surfaces import is_surface_file
+from scenes.surfaces import OTHER_ENDINGS, is_surface_file
 from scenes.terminal import Progress, silent
 from scenes.volumes.dicom_references import DicomReferences
 from scenes.volumes.lazy_volume import LazyVolume
 from scenes.volumes.volume_files import ENDINGS, file_volume, is_volume_file
 
-# Surfaces that no installed library reads.
-OTHER_SURFACES = (".vtk", ".vtp", ".vtu", ".3mf", ".fbx")
 SLICER_KEY = re.compile(r"Segment(\d+)_Name$")
 
 
@@ -65,7 +63,7 @@ def open_labels(
         return _label_map_file(path)
     if path.is_file() and is_surface_file(path):
         return read_surfaces([path], NEAR_MM, progress)
-    if path.suffix.lower() in OTHER_SURFACES:
+    if path.suffix.lower() in OTHER_ENDINGS:
         raise PatientError(f"{path}: is a surface that cannot be read here; export it as STL, PLY or OBJ")
     if of_files := _files_of_folder(path, wanted, progress):
         return of_files

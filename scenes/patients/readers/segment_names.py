@@ -26,7 +26,7 @@ TISSUE_OF_NAME: tuple[tuple[str, str], ...] = (
 )  # fmt: skip
 # Structures of TotalSegmentator that are too far from a kidney to be in its image.
 FAR = (
-    r"brain|skull|face|heart|atri(um|al)|ventric|myocard|lung|pulmon|humerus|clavic|scapula|femur|sacrum|\bhips?\b|"
+    r"brain|skull|\bface\b|heart|atri(um|al)|ventric|myocard|lung|pulmon|humerus|clavic|scapula|femur|sacrum|\bhips?\b|"
     r"vertebrae (c\d|t[1-8]\b)|rib (left|right) [1-7]\b|trachea|o?esophagus|thyroid|prostate|bladder|gluteus|"
     r"brachiocephal|subclavian|carotid|sternum|costal|spinal cord|iliac (artery|vena)"
 )

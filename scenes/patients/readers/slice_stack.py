@@ -12,6 +12,7 @@ from scipy import ndimage
 from errors import PatientError
 from scenes.patients.readers.dicom_headers import DicomSlice
 from scenes.patients.readers.dicom_pixels import hounsfield
+from scenes.patients.readers.label_maps import listed
 from scenes.volumes.lazy_volume import AIR_HU, LazyVolume
 from scenes.volumes.voxel_grid import Box, VoxelGrid
 
@@ -136,8 +137,9 @@ def _without_duplicates(
         )
     copies = [copy for group in groups for copy in group[1:]]
     if copies:
-        named = ", ".join(one.label for one in copies[:3]) + (" and others" if len(copies) > 3 else "")
-        notes.append(f"duplicates, taken once: {named}")
+        # A note is in the patient's folder: no names of files, which may be the patient's.
+        numbers = ["without a number" if one.number is None else str(one.number) for one in copies]
+        notes.append(f"duplicates, taken once: slice {listed(numbers)}")
     return [group[0] for group in groups]
 
 

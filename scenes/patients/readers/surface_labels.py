@@ -17,6 +17,8 @@ from scenes.volumes.voxel_grid import VoxelGrid
 
 # Voxels along the edge of a cube of a structure's volume, and limits of their width [mm].
 VOXELS, VOXEL_MM = 75, (0.5, 1.5)
+# Voxels of a box: those of a structure that is long and thin, such as vessels, become wider for that.
+MOST_VOXELS = 30e6
 # The first voxel before the surface, in voxels. On voxels that lie evenly about a ball, the errors of eight octants would be one, not
 # eight: 0.6 % of its volume instead of 0.07 % (radius 5 to 10 mm).
 FIRST_VOXEL = np.array([0.13, 0.29, 0.41])
@@ -115,7 +117,7 @@ def _check_place(file: Path, surface: trimesh.Trimesh, space: Space | None, ct: 
     """Raises PatientError where a surface is outside the CT, but inside it in the other coordinate system."""
     other: Space = "LPS" if space == "RAS" else "RAS"
     here, there = (
-        _share_in(ct, vertices) for vertices in (surface.vertices, surface.vertices * (-1.0, -1.0, 1.0))
+        ct.share_inside(vertices) for vertices in (surface.vertices, surface.vertices * (-1.0, -1.0, 1.0))
     )
     if here < LEAST_IN_CT < there:
         stated = "as it states" if space else "as was assumed"
@@ -125,17 +127,13 @@ def _check_place(file: Path, surface: trimesh.Trimesh, space: Space | None, ct: 
         )
 
 
-def _share_in(grid: VoxelGrid, places: np.ndarray) -> float:
-    found = grid.index(places)
-    return float(((found >= -0.5) & (found <= np.array(grid.size) - 0.5)).all(axis=1).mean())
-
-
 def _grid_of(surface: trimesh.Trimesh, low: np.ndarray, high: np.ndarray) -> VoxelGrid | None:
     """Voxels around the part of a surface in an LPS box [mm]; None where there is none."""
     width = float(np.clip(np.cbrt(abs(surface.volume)) / VOXELS, *VOXEL_MM))
     first, last = np.maximum(surface.bounds[0], low), np.minimum(surface.bounds[1], high)
     if not (first < last).all():
         return None
+    width = max(width, float(np.cbrt(np.prod(last - first) / MOST_VOXELS)))
     size = np.ceil((last - first) / width).astype(int) + 1
     x, y, z = (max(2, int(n)) for n in size)
     return VoxelGrid((x, y, z), np.full(3, width), first - width * FIRST_VOXEL, np.eye(3))
