@@ -43,7 +43,7 @@ LEAST_BRIGHT = 0.85
 # Of two colours, in CIELAB: well above what side by side lines need.
 LEAST_DIFFERENCE = 20.0
 # Lengths of the scale bar, and its largest share of the image's width: the letter is in the middle.
-BARS_MM, BAR_SHARE = (50.0, 20.0), 0.35
+BARS_MM, BAR_SHARE = (50.0, 20.0), 0.4
 # Letters in a line of the largest text, its sizes [points], and lines times size that fit above the names of the colours.
 TEXT_WIDTH = 56
 TEXT_POINTS = (8.5, 8.0, 7.5, 7.0, 6.5, 6.0, 5.5, 5.0)
