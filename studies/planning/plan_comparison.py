@@ -11,15 +11,15 @@ import numpy as np
 import trimesh
 from tqdm import tqdm
 
-from rehearsal.commands.command_line import make_folder
+from rehearsal.commands.command_line import load_patient, make_folder
 from rehearsal.configuration import PRESETS, probe_of, scene_of
 from rehearsal.planning.plan_search import make_plan, total_work, try_path, work_at
 from rehearsal.planning.sweep_score import ScoreTerms, score
 from rehearsal.planning.sweep_trial import PlanningProblem, Trial
 from rehearsal.planning.trial_workers import TrialWorkers
 from rehearsal.worker_processes import Workers
-from scenes.anatomy import LoadedAnatomy, load_anatomy
-from scenes.scene import EMBEDDED, Scene, load_scene, scene_file, with_options
+from scenes.anatomy import LoadedAnatomy
+from scenes.scene import EMBEDDED, Scene
 from studies.planning.baseline_sweeps import UNPLANNED, planned, random_sweep
 from studies.study_options import dask_option, jobs_option, out_option, trials_option
 from studies.study_results import text_table, write_results
@@ -70,9 +70,8 @@ def plan_study(
         tqdm(total=len(patients) * count_of(trials), desc="plan", unit="trial") as bar,
     ):
         for number, each in enumerate(patients, 1):
-            path = scene_file(each)
-            scene = with_options(load_scene(path), {"transducer.probe": probe})
-            anatomy = with_tumour(load_anatomy(scene, path.parent), np.array(scene.gravity.direction))
+            scene, loaded = load_patient(each, {"transducer.probe": probe})
+            anatomy = with_tumour(loaded, np.array(scene.gravity.direction))
             run = compare(scene, anatomy, trials, workers, bar.update)
             runs.append(dict(patient=scene.title or f"patient {number}") | run)
             bar.update(number * bar.total // len(patients) - bar.n)
