@@ -1,7 +1,7 @@
 """A rehearsal from start to end: its input source, its recording, and its summary."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -41,7 +41,7 @@ from render.viewer import Settings
 from render.window import Window
 from scenes.anatomy import LoadedAnatomy
 from scenes.import_findings import open_warnings
-from scenes.scene import EMBEDDED
+from scenes.scene import EMBEDDED, SceneError
 from scenes.terminal import shell_command
 from scenes.tumour_complexity import complexity
 from version import VERSION
@@ -239,8 +239,11 @@ class RehearsalRun:
         # Matplotlib takes half a second to import.
         from rehearsal.resection.resection_page import report_of
 
-        warnings = list(open_warnings(self.files.scene, self.files.folder))
-        return report_of(self.rehearsal, self.files.resection_plan) | dict(import_warnings=warnings)
+        warnings = self.files.warnings
+        # Damaged since the start: the session must still end in order.
+        with suppress(SceneError):
+            warnings = open_warnings(self.files.scene, self.files.folder)
+        return report_of(self.rehearsal, self.files.resection_plan) | dict(import_warnings=list(warnings))
 
     def _end(self, bookmarks: int) -> None:
         summary, report = self.measurements.summary(bookmarks), self._resection()
