@@ -77,6 +77,21 @@ class TestLabelMaps:
         (one,) = open_labels(tmp_path / "kidney_right.nii.gz").maps(None)
         assert [(s.tissue, s.side) for s in one.segments.values()] == [("kidney", "right")]
 
+    @pytest.mark.parametrize(
+        ("stem", "tissue", "side"),
+        [
+            ("label_left", "kidney", "left"),
+            ("r", "kidney", "right"),
+            ("spleen_left", None, "left"),
+            ("lung_left", None, "left"),
+        ],
+    )
+    def test_a_name_with_a_side_alone_is_the_kidneys(self, tmp_path, stem, tissue, side):
+        empty = grid_around((-33, 18, -401), (-22, 30, -385), (0.7, 0.9, 1.6))
+        sitk.WriteImage(drawn(empty, (4, KIDNEY)), str(tmp_path / f"{stem}.nii.gz"))
+        (one,) = open_labels(tmp_path / f"{stem}.nii.gz").maps(None)
+        assert [(s.tissue, s.side) for s in one.segments.values()] == [(tissue, side)]
+
     def test_organs_are_read_near_the_kidneys(self, tmp_path):
         """And all that a picture shows of them: 80 mm around."""
         empty = grid_around((-20, -20, -150), (20, 20, 150), (4.0, 4.0, 5.0), DIRECTIONS["slices first"])

@@ -22,7 +22,7 @@ from scenes.patients.readers.label_maps import (
 )
 from scenes.patients.readers.rtstruct import read_structures
 from scenes.patients.readers.segment_codes import slicer_meaning
-from scenes.patients.readers.segment_names import is_far, side_of, tissue_of
+from scenes.patients.readers.segment_names import is_far, is_needless, side_of, tissue_of
 from scenes.patients.readers.surface_labels import read_surfaces
 from scenes.surfaces import ENDINGS as SURFACE_ENDINGS
 from scenes.surfaces import is_surface_file
@@ -141,7 +141,12 @@ def _label_map_file(path: Path) -> Segmentation:
     stem = _stem(path)
     if not names and len(maps[0].segments) == len(maps) == 1 and (tissue_of(stem) or side_of(stem)):
         (value,) = maps[0].segments
-        maps = [replace(maps[0], segments={value: Segment.named(stem, value)})]
+        segment = Segment.named(stem, value)
+        # A name with a side alone says no more than none: the kidney.
+        is_kidney = not segment.is_understood and not is_needless(stem)
+        maps = [
+            replace(maps[0], segments={value: replace(segment, tissue="kidney") if is_kidney else segment})
+        ]
     return Segmentation(
         lambda _: maps, identifiers=volume.identifiers, grid=volume.grid, empty=tuple(unused.values())
     )
