@@ -1,5 +1,6 @@
 """The command import from end to end: what a hospital sends becomes a patient's folder that names nobody."""
 
+import re
 from dataclasses import replace
 
 import nibabel
@@ -18,6 +19,8 @@ from scenes.patients.import_command import position_mm
 from scenes.patients.import_request import import_request, volume_of_labels
 from scenes.patients.patient_folder import is_identifying, save_patient, without_identifiers
 from scenes.patients.readers.ct_series import open_ct
+from scenes.patients.readers.dicom_files import SourceFile
+from scenes.patients.readers.identifiers import identifiers_of
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import LabelMap
 from scenes.scene import load_scene
@@ -218,13 +221,10 @@ class TestExchanged:
         with pytest.raises(PatientError, match=words):
             import_request(paths / ct, [paths / labels], side="left")
 
-    @pytest.mark.parametrize("n", [0, 1])
-    def test_a_surface(self, paths, n):
+    def test_a_surface(self, paths):
         (paths / "bed.stl").write_bytes(b"solid")
-        given = [paths / "ct", paths / "seg.dcm"]
-        given[n] = paths / "bed.stl"
         with pytest.raises(PatientError, match="is a surface; expected a CT or labels in voxels"):
-            import_request(given[0], given[1:])
+            import_request(paths / "bed.stl", [paths / "seg.dcm"])
 
 
 class TestIdentifiers:
@@ -272,6 +272,25 @@ class TestIdentifiers:
             assert is_identifying(text), text
         for text in ("", "7", "AB", "12345", "kidney", "Left Kidney", "STL", "kidney 3.5 mm", "vein"):
             assert not is_identifying(text), text
+
+    def test_no_word_that_every_import_writes(self, written):
+        """A series with the description "low" could not be imported: so does import.json describe a tumour."""
+        heads = [
+            file.read_bytes().partition(b"\n\n")[0] if file.suffix == ".nrrd" else file.read_bytes()
+            for file in sorted(written.iterdir())
+            if file.suffix in (".nrrd", ".json", ".toml")
+        ]
+        words = set(re.findall(r"[A-Za-z]{3,}", b" ".join(heads).decode().replace("_", " ")))
+        written_always = words - set(re.findall(r"[A-Za-z]{3,}", " ".join(read_findings(written).notes)))
+        assert [word for word in sorted(written_always) if is_identifying(word)] == []
+        for word in ("true", "false", "null", "low", "moderate", "high", "prone", "decubitus"):
+            assert not is_identifying(word), word
+
+    def test_regions_of_a_structure_set(self, tmp_path):
+        """Structures and sides name nobody, so that notes can name them; other words may."""
+        path = write_structures(tmp_path / "rt.dcm", {"BODY": [], "Niere links": [], "GTV Doe": []})
+        identifiers = identifiers_of(SourceFile("rt.dcm", lambda: path.open("rb"), path))
+        assert "GTV Doe" in identifiers and not {"BODY", "Niere links"} & {*identifiers}
 
     @pytest.mark.parametrize(
         "text", ["15.0", "3.5", "0.45", "1-3", "0.3515625", "512\\512", "0.5, 0.25", "-110.0"]

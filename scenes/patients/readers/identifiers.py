@@ -6,6 +6,7 @@ from pydicom.dataelem import DataElement
 from pydicom.dataset import Dataset
 
 from scenes.patients.readers.dicom_files import SourceFile
+from scenes.patients.readers.segment_names import is_anatomy
 
 # Value representations that identify persons, dates and objects; UI also has standard UIDs, which identify nobody.
 NAMING = ("PN", "DA", "DT", "UI")
@@ -45,7 +46,8 @@ def _texts(data: Dataset) -> Iterator[tuple[str, str]]:
         personal = element.tag.is_private or any(word in element.keyword for word in PERSONAL_KEYWORDS)
         if element.VR in NAMING or (element.VR in FREE_TEXT and personal):
             place = f"{place} {element.keyword or '(private)'}"
-            yield from ((text, place) for text in _words(element))
+            is_structure = element.keyword == "ROIName" and is_anatomy(str(element.value))
+            yield from ((text, place) for text in _words(element) if not is_structure)
 
 
 def _words(element: DataElement) -> Iterator[str]:

@@ -63,6 +63,13 @@ def is_needless(name: str) -> bool:
     return is_far(name) or re.search(OUTLINE, _plain(name)) is not None
 
 
+def is_anatomy(text: str) -> bool:
+    """Whether all words of a text are structures and sides, which identify nobody."""
+    return all(
+        is_understood(word) or is_needless(word) or side_of(word) for word in re.findall(r"[^\W_]+", text)
+    )
+
+
 def side_of(name: str) -> Side | None:
     """The side in a name such as kidney_left or "Kidney R"; None where it has none, or both."""
     plain = _plain(name)
