@@ -286,8 +286,13 @@ class TestIdentifiers:
         for word in ("true", "false", "null", "low", "moderate", "high", "prone", "decubitus"):
             assert not is_identifying(word), word
 
-    def test_regions_of_a_structure_set(self, tmp_path):
+    def test_labels_in_dicom(self, tmp_path):
         """Structures and sides name nobody, so that notes can name them; other words may."""
+        series = Series(tmp_path / "ct")
+        inside = np.ones(series.size[::-1], bool)
+        path = write_segmentation(tmp_path / "seg.dcm", series, {"Left kidney": inside, "Kidney Doe": inside})
+        identifiers = identifiers_of(SourceFile("seg.dcm", lambda: path.open("rb"), path))
+        assert "Kidney Doe" in identifiers and "Left kidney" not in identifiers
         path = write_structures(tmp_path / "rt.dcm", {"BODY": [], "Niere links": [], "GTV Doe": []})
         identifiers = identifiers_of(SourceFile("rt.dcm", lambda: path.open("rb"), path))
         assert "GTV Doe" in identifiers and not {"BODY", "Niere links"} & {*identifiers}

@@ -22,7 +22,13 @@ from scenes.patients.readers.label_maps import (
 )
 from scenes.patients.readers.rtstruct import read_structures
 from scenes.patients.readers.segment_codes import slicer_meaning
-from scenes.patients.readers.segment_names import is_far, is_needless, side_of, tissue_of
+from scenes.patients.readers.segment_names import (
+    is_far,
+    is_needless,
+    names_that_may_identify,
+    side_of,
+    tissue_of,
+)
 from scenes.patients.readers.surface_labels import read_surfaces
 from scenes.surfaces import ENDINGS as SURFACE_ENDINGS
 from scenes.surfaces import is_surface_file
@@ -33,6 +39,7 @@ from scenes.volumes.volume_files import ENDINGS, file_volume, is_volume_file
 
 # Surfaces that no installed library reads.
 OTHER_SURFACES = (".vtk", ".vtp", ".vtu", ".3mf", ".fbx")
+NAME_OF_LABEL = "the name of a label or its file"
 SLICER_KEY = re.compile(r"Segment(\d+)_Name$")
 
 
@@ -147,8 +154,13 @@ def _label_map_file(path: Path) -> Segmentation:
         maps = [
             replace(maps[0], segments={value: replace(segment, tissue="kidney") if is_kidney else segment})
         ]
+    called = [segment.name for one in maps for segment in one.segments.values()]
+    called += [segment.name for segment in unused.values()]
     return Segmentation(
-        lambda _: maps, identifiers=volume.identifiers, grid=volume.grid, empty=tuple(unused.values())
+        lambda _: maps,
+        identifiers={**volume.identifiers, **names_that_may_identify(called, NAME_OF_LABEL)},
+        grid=volume.grid,
+        empty=tuple(unused.values()),
     )
 
 
@@ -184,7 +196,7 @@ def _file_per_organ(
     near.sort(key=lambda file: tissue_of(_stem(file)) != "kidney")
     maps: list[LabelMap] = []
     empty: list[Segment] = []
-    identifiers: dict[str, str] = {}
+    identifiers = names_that_may_identify(map(_stem, files), NAME_OF_LABEL)
     around: np.ndarray | None = None
     for file in progress(near, "labels"):
         volume = file_volume(file)
