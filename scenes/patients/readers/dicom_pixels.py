@@ -46,6 +46,8 @@ def _check_length(item: SourceFile, data: Dataset) -> None:
     syntax = data.file_meta.get("TransferSyntaxUID")
     if syntax is None or not syntax.is_transfer_syntax or syntax.is_encapsulated or "PixelData" not in data:
         return
+    if data.get("BitsAllocated") == 1:  # of a segmentation: packed over the ends of frames
+        return
     with parsing(
         f"{item.name}: Rows, Columns, BitsAllocated or NumberOfFrames cannot be read",
         "expected whole numbers",
