@@ -32,7 +32,15 @@ ENCODINGS = ("utf-8", "utf-16-le", "latin-1")
 UID = re.compile(r"[0-9.]+")
 NUMBERS = re.compile(rb"(?:[0-9.]\0?){4,}")
 GZIP = 31  # zlib's wbits for gzip
-COMMON = "supine prone decubitus low moderate high left right kidney cyst vessels collecting system STL LPS ITK NRRD complete type int short unsigned char gzip space mm ml HU CT"
+# Of NRRD and STL headers, and of import.json; those of scene.toml are added below.
+COMMON = (
+    "left right kidney cyst vessels collecting system STL LPS ITK NRRD complete type int short unsigned char gzip space mm ml HU CT "
+    "file format specification at http teem sourceforge net html dimension posterior superior sizes directions kinds domain endian little "
+    "encoding origin version side draft supine prone decubitus position extent surfaces faces volume label labels support series source "
+    "size spacing direction tissues warnings notes text acknowledged true false null none complexity tumours diameter exophytic share "
+    "contact distance touches main vessel renal padua estimated not known needed least most suffix low moderate high to components points "
+    "measure unit location rim sinus artery and vein cm mesh kind "
+)
 
 
 def save_patient(

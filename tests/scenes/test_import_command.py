@@ -1,6 +1,7 @@
 """The command import from end to end: what a hospital sends becomes a patient's folder that names nobody."""
 
 import json
+import re
 from contextlib import nullcontext
 from dataclasses import replace
 from time import perf_counter
@@ -21,6 +22,8 @@ from scenes.patients.import_command import position_mm
 from scenes.patients.import_request import import_request, volume_of_labels
 from scenes.patients.patient_folder import is_identifying, save_patient, without_identifiers
 from scenes.patients.readers.ct_series import open_ct
+from scenes.patients.readers.dicom_files import SourceFile
+from scenes.patients.readers.identifiers import identifiers_of
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import LabelMap
 from scenes.scene import load_scene
@@ -302,6 +305,30 @@ class TestIdentifiers:
             "prone",
         ):
             assert not is_identifying(text), text
+
+    def test_no_word_that_every_import_writes(self, written):
+        """A series with the description "low" could not be imported: so does import.json describe a tumour."""
+        heads = [
+            file.read_bytes().partition(b"\n\n")[0] if file.suffix == ".nrrd" else file.read_bytes()
+            for file in sorted(written.iterdir())
+            if file.suffix in (".nrrd", ".json", ".toml")
+        ]
+        words = set(re.findall(r"[A-Za-z]{3,}", b" ".join(heads).decode().replace("_", " ")))
+        written_always = words - set(re.findall(r"[A-Za-z]{3,}", " ".join(read_findings(written).notes)))
+        assert [word for word in sorted(written_always) if is_identifying(word)] == []
+        for word in ("true", "false", "null", "low", "moderate", "high", "prone", "decubitus"):
+            assert not is_identifying(word), word
+
+    def test_labels_in_dicom(self, tmp_path):
+        """Structures and sides name nobody, so that notes can name them; other words may."""
+        series = Series(tmp_path / "ct")
+        inside = np.ones(series.size[::-1], bool)
+        path = write_segmentation(tmp_path / "seg.dcm", series, {"Left kidney": inside, "Kidney Doe": inside})
+        identifiers = identifiers_of(SourceFile("seg.dcm", lambda: path.open("rb"), path))
+        assert "Kidney Doe" in identifiers and "Left kidney" not in identifiers
+        path = write_structures(tmp_path / "rt.dcm", {"BODY": [], "Niere links": [], "GTV Doe": []})
+        identifiers = identifiers_of(SourceFile("rt.dcm", lambda: path.open("rb"), path))
+        assert "GTV Doe" in identifiers and not {"BODY", "Niere links"} & {*identifiers}
 
     @pytest.mark.parametrize(
         "text", ["15.0", "3.5", "0.45", "1-3", "0.3515625", "512\\512", "0.5, 0.25", "-110.0"]

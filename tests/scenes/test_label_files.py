@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import SimpleITK as sitk
+import trimesh
 from dicom_series import Series, refusal, write_segmentation, write_structures
 from synthetic_body import DIRECTIONS, drawn, grid_around
 from test_readers_labels import KIDNEY, by_name, ct_grid, ring
@@ -76,6 +77,41 @@ class TestLabelMaps:
         sitk.WriteImage(drawn(empty, (4, KIDNEY)), str(tmp_path / "kidney_right.nii.gz"))
         (one,) = open_labels(tmp_path / "kidney_right.nii.gz").maps(None)
         assert [(s.tissue, s.side) for s in one.segments.values()] == [("kidney", "right")]
+
+    @pytest.mark.parametrize(
+        ("stem", "tissue", "side"),
+        [
+            ("label_left", "kidney", "left"),
+            ("r", "kidney", "right"),
+            ("spleen_left", None, "left"),
+            ("lung_left", None, "left"),
+        ],
+    )
+    def test_a_name_with_a_side_alone_is_the_kidneys(self, tmp_path, stem, tissue, side):
+        empty = grid_around((-33, 18, -401), (-22, 30, -385), (0.7, 0.9, 1.6))
+        sitk.WriteImage(drawn(empty, (4, KIDNEY)), str(tmp_path / f"{stem}.nii.gz"))
+        (one,) = open_labels(tmp_path / f"{stem}.nii.gz").maps(None)
+        assert [(s.tissue, s.side) for s in one.segments.values()] == [(tissue, side)]
+
+    @pytest.mark.parametrize("form", ["file", "folder", "Slicer", "surface"])
+    def test_names_of_labels_may_be_the_patients(self, tmp_path, form):
+        """Structures are none; a warning of the import may quote any name."""
+        empty = grid_around((-33, 18, -401), (-22, 30, -385), (0.7, 0.9, 1.6))
+        image = drawn(empty, (1, KIDNEY))
+        path = tmp_path / "a" / f"Doe_left{'.stl' if form == 'surface' else '.nii.gz'}"
+        path.parent.mkdir()
+        if form == "surface":
+            trimesh.creation.icosphere(radius=30).export(path)
+        elif form == "Slicer":
+            path = path.with_name("kidney.seg.nrrd")
+            image.SetMetaData("Segment0_Name", "Doe_left")
+        if form != "surface":
+            sitk.WriteImage(image, str(path))
+        if form == "folder":
+            sitk.WriteImage(image, str(path.with_name("kidney_left.nii.gz")))
+            path = path.parent
+        identifiers = open_labels(path).identifiers
+        assert "Doe_left" in identifiers and not {"kidney_left", "kidney"} & {*identifiers}
 
     def test_organs_are_read_near_the_kidneys(self, tmp_path):
         """And all that a picture shows of them: 80 mm around."""

@@ -22,7 +22,7 @@ from test_readers_labels import by_name, ct_grid, ring
 from scenes.patients.readers import dicom_seg
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import NEAR_MM
-from scenes.patients.readers.segment_names import is_needless
+from scenes.patients.readers.segment_names import is_anatomy, is_needless
 
 NEEDLESS = [
     "BODY", "Body", "External", "external_1", "Skin", "Patient", "Patient outline", "Outer Contour", "Body contour", "whole body",
@@ -37,6 +37,14 @@ NEEDED = [
 def test_needless_names():
     assert [name for name in NEEDLESS if not is_needless(name)] == []
     assert [name for name in NEEDED if is_needless(name)] == []
+
+
+def test_names_of_structures_alone():
+    """They identify nobody."""
+    of_structures = "adrenal_gland_left|Niere links|vertebrae_L2|kidneyL|Kidney 2|BODY|left|Segment_1|portal_vein_and_splenic_vein|"
+    assert [name for name in of_structures.split("|") if not is_anatomy(name)] == []
+    of_persons = "Doe|kidney Doe|Doe_left|kidney 19600229|Mr L"
+    assert [name for name in of_persons.split("|") if is_anatomy(name)] == []
 
 
 class TestStructures:

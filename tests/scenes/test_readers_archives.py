@@ -18,6 +18,11 @@ class TestArchives:
         )
         assert "GiB of DICOM; expected at most" in refused(path)
 
+    def test_one_that_ends_early(self, tmp_path, refused):
+        path = zipped(Series(tmp_path / "ct").write(), tmp_path / "a.zip")
+        path.write_bytes(path.read_bytes()[:-100])
+        assert "a damaged archive" in refused(path)
+
     def test_many_files(self, tmp_path, refused, monkeypatch):
         monkeypatch.setattr(dicom_files, "MOST_FILES", 5)
         assert "more than 5 files" in refused(Series(tmp_path / "ct").write())

@@ -6,6 +6,9 @@ import numpy as np
 import pydicom
 import pytest
 from dicom_series import Series, read_ct, refusal, save, write_dicomdir, zipped
+from pydicom.datadict import dictionary_VR
+from pydicom.dataelem import RawDataElement
+from pydicom.tag import Tag
 from pydicom.uid import (
     DeflatedExplicitVRLittleEndian,
     ExplicitVRBigEndian,
@@ -336,14 +339,20 @@ class TestRefused:
             ({"NumberOfFrames": 2}, "2 frames"),
             ({"SamplesPerPixel": 3}, "colours"),
             ({"ImagePositionPatient": None}, "has no ImagePositionPatient"),
-            ({"ImagePositionPatient": [1, 2]}, "ImagePositionPatient is not 3 numbers"),
-            ({"ImageOrientationPatient": [1, 0, 0, 1, 0, 0]}, "ImageOrientationPatient"),
+            ({"ImagePositionPatient": [1, 2]}, "ImagePositionPatient is 1, 2; expected 3 numbers"),
+            ({"ImagePositionPatient": [1, 2, 1e30]}, "1, 2, 1e+30; expected 3 numbers, none beyond 1000000"),
+            ({"ImageOrientationPatient": [1, 0, 0, 1, 0, 0]}, "is 1, 0, 0, 1, 0, 0; expected two orthogonal"),
             ({"ImageOrientationPatient": None}, "has no ImageOrientationPatient"),
             ({"PixelSpacing": None}, "has no PixelSpacing"),
             ({"PixelSpacing": [0, 0.7]}, "0.7 x 0 mm"),
-            ({"PixelSpacing": [-0.7, 0.7]}, "mm"),
+            (
+                {"PixelSpacing": [-0.7, 0.7]},
+                "PixelSpacing are those of 12 x 10 pixels of 0.7 x -0.7 mm; expected",
+            ),
+            ({"Rows": 0}, "Rows and PixelSpacing are those of 12 x 0 pixels"),
             ({"PixelSpacing": [70, 70]}, "voxels of 70 x 70"),
             ({"RescaleSlope": 0}, "RescaleSlope is 0"),
+            ({"RescaleIntercept": 1e30}, "RescaleIntercept is 1e+30; expected 1 number"),
             ({"ImageType": ["DERIVED", "PRIMARY", "AXIAL", "MTT"]}, "MTT; expected HU"),
         ],
     )
@@ -356,6 +365,52 @@ class TestRefused:
             data[name]._value = "Doe^Jane" if name != "Rows" else 0
 
         refusal(Series(tmp_path).write(edit=garbled), name="s1-")
+
+    @pytest.mark.parametrize(
+        "name",
+        [
+            "PixelSpacing", "ImagePositionPatient", "ImageOrientationPatient", "RescaleSlope", "RescaleIntercept", "InstanceNumber",
+            "NumberOfFrames",
+        ],
+    )  # fmt: skip
+    @pytest.mark.parametrize("text", [b"Doe^Jane", b"nan\\nan "])
+    def test_text_in_numbers(self, tmp_path, name, text):
+        """The element is named; its text, which may be the patient's name, is not."""
+        series = Series(tmp_path)
+
+        def garbled(data, k):
+            if k == 2:
+                vr = dictionary_VR(name)
+                data[Tag(name)] = RawDataElement(Tag(name), vr, len(text), text, 0, False, True)
+
+        message = refusal(series.write(edit=garbled))
+        assert f"s1-2.dcm: {name} " in message and "; expected" in message and "export" in message
+
+    @pytest.mark.parametrize("tags", [{"Rows": 9}, {"Columns": 11}, {"BitsAllocated": 8}], ids=str)
+    def test_more_pixels_than_the_header_has(self, tmp_path, tags):
+        """Read by such Columns, every row would be shifted against the one before."""
+        message = refusal(Series(tmp_path).write(**tags), name="s1-0.dcm")
+        assert "PixelData has 240 bytes; expected" in message and "Rows, Columns, BitsAllocated" in message
+
+    def test_a_slice_of_another_size_is_named(self, tmp_path):
+        """One of many is taken for a localizer, and leaves a gap."""
+        series = Series(tmp_path, size=(12, 10, 14))
+        series.write(edit=lambda data, k: setattr(data, "Rows", 9) if k == 5 else None)
+        message = refusal(tmp_path)
+        assert "expected no slice to be missing" in message
+        assert message.endswith("left out, in another view or size: slice 6 (s1-5.dcm)")
+
+    def test_a_header_that_ends_early_is_named(self, tmp_path):
+        """It has lost the UID of its series, so that the series lacks a slice."""
+        series = Series(tmp_path)
+        series.write()
+        broken = tmp_path / "s1-3.dcm"
+        content = broken.read_bytes()
+        broken.write_bytes(content[: content.index(b"\x20\x00\x0d\x00")])
+        message = refusal(tmp_path)
+        assert (
+            "expected no slice to be missing" in message and "left out, damaged: s1-3.dcm: has no" in message
+        )
 
     def test_mixed_orientation(self, tmp_path):
         series = Series(tmp_path)

@@ -1,6 +1,8 @@
 """Open a CT: a volume file, or one series of DICOM files; or list what a path has."""
 
 from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from scenes.patients.readers.dicom_files import SourceFile, find_dicom_files
 from scenes.patients.readers.dicom_headers import DicomContents, DicomSlice, Series, read_headers
 from scenes.patients.readers.identifiers import identifiers_of
 from scenes.patients.readers.label_headers import label_header
+from scenes.patients.readers.label_maps import listed
 from scenes.patients.readers.series_choice import (
     UID_END,
     choose_series,
@@ -130,7 +133,10 @@ def open_ct(
     if volumes:
         # No names, which may be the patient's.
         notes.append(f"left out, beside the DICOM files: {len(volumes)} NIfTI, NRRD or MHA files")
-    volume = _series_volume(path, chosen, progress)
+    # A damaged header may have lost the UID of its series.
+    damaged = [fault for s in found.candidates if s is not chosen and not s.slices for fault in s.faults]
+    with _naming("damaged", damaged):
+        volume = _series_volume(path, chosen, progress)
     return replace(volume, notes=(*notes, *volume.notes))
 
 
@@ -170,16 +176,17 @@ def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume
             f"{path}: {fault}{f' (and {more} more files of this series)' if more else ''}; "
             "export the series again"
         )
-    slices, left_out = _one_view(series)
+    slices, strays = _one_view(series)
     notes = []
-    if series.localizers + left_out:
-        notes.append(f"left out, localisers: {series.localizers + left_out}")
+    if series.localizers + len(strays):
+        notes.append(f"left out, localisers: {series.localizers + len(strays)}")
     if not all(one.is_rescaled for one in slices):
         notes.append("the files have no rescale: their values were taken as HU")
     positions = {one.patient_position for one in slices} - {""}
     if len(positions) > 1:
         notes.append("the slices have different PatientPositions: none was taken")
-    stack = stack_slices(str(path), slices, lambda files: progress(files, "slices"))
+    with _naming("in another view or size", [one.label for one in strays]):
+        stack = stack_slices(str(path), slices, lambda files: progress(files, "slices"))
     return replace(
         stack,
         notes=(*notes, *stack.notes),
@@ -188,6 +195,17 @@ def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume
         patient_position=positions.pop() if len(positions) == 1 else "",
         identifiers=identifiers_of(slices[0].item),
     )
+
+
+@contextmanager
+def _naming(what: str, left_out: Sequence[str]) -> Iterator[None]:
+    """Adds to an error the files that were left out of a series, which may lack them."""
+    try:
+        yield
+    except PatientError as error:
+        if not left_out:
+            raise
+        raise PatientError(f"{error}; left out, {what}: {listed(left_out)}") from error
 
 
 def _row_of_file(volume: LazyVolume) -> SeriesRow:
@@ -249,16 +267,16 @@ def _contents_without_ct(found: DicomContents) -> str:
     return f"no CT slices, but {', '.join(kinds)}" if kinds else "no CT slices"
 
 
-def _one_view(series: Series) -> tuple[list[DicomSlice], int]:
-    """The slices without a few in another view, and how many those are."""
+def _one_view(series: Series) -> tuple[list[DicomSlice], list[DicomSlice]]:
+    """The slices without a few in another view, and those."""
 
     def view(one: DicomSlice) -> tuple:
         return (*np.round(np.concatenate([one.row, one.column]), 2).tolist(), one.rows, one.columns)
 
     views = [view(one) for one in series.slices]
     main = max(views, key=views.count)
-    kept = [one for one, seen in zip(series.slices, views, strict=True) if seen == main]
-    stray = len(views) - len(kept)
-    if stray and stray <= STRAY * len(views):
-        return kept, stray
-    return series.slices, 0
+    kept, strays = (
+        [one for one, seen in zip(series.slices, views, strict=True) if (seen == main) == is_kept]
+        for is_kept in (True, False)
+    )
+    return (kept, strays) if len(strays) <= STRAY * len(views) else (series.slices, [])

@@ -24,6 +24,7 @@ config.settings.reading_validation_mode = config.IGNORE
 logging.getLogger("pydicom").setLevel(logging.CRITICAL)
 
 MAGIC_AT, MAGIC = 128, b"DICM"
+ARCHIVE = b"PK\3\4"
 START_BYTES = MAGIC_AT + len(MAGIC)
 # The limit of a deflated data set, against decompression bombs.
 MOST_INFLATED = 2 * 2**30
@@ -86,13 +87,19 @@ def find_dicom_files(path: Path) -> list[SourceFile]:
     """
     if path.is_dir():
         items = _of_folder(path)
-    elif zipfile.is_zipfile(path):
+    elif zipfile.is_zipfile(path) or _begins_as_archive(path):
         return _of_archive(path)
     elif path.name.upper() == "DICOMDIR":
         items = _of_directory_file(path)
     else:
         items = [_disk_file(path, path.name)]
     return [item for item in items if _begins_as_dicom(item)]
+
+
+def _begins_as_archive(path: Path) -> bool:
+    """Whether a file begins as a zip archive, also one whose end is missing."""
+    with path.open("rb") as file:
+        return file.read(len(ARCHIVE)) == ARCHIVE
 
 
 def _disk_file(path: Path, name: str) -> SourceFile:

@@ -25,6 +25,8 @@ LABEL_CLASSES = {
 }
 MEDIA_DIRECTORY = "1.2.840.10008.1.3.10"
 MOST_PIXELS = 8192 * 8192
+# No position [mm] and no rescale of a CT has larger numbers.
+MOST = 1e6
 TAGS = [
     "SOPClassUID", "SOPInstanceUID", "Modality", "SeriesInstanceUID", "SeriesNumber", "InstanceNumber",
     "ImageType", "FrameOfReferenceUID", "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing",
@@ -171,11 +173,14 @@ def slices_of(item: SourceFile, header: Dataset) -> list[DicomSlice | None]:
             raise PatientError(f"{item.name}: has text burned into its pixels, which may name the patient")
         if int(header.get("SamplesPerPixel", 1)) != 1:
             raise PatientError(f"{item.name}: has colours; expected HU")
-        frames, count = header.get("PerFrameFunctionalGroupsSequence"), int(header.get("NumberOfFrames") or 1)
+        frames, count = (
+            header.get("PerFrameFunctionalGroupsSequence"),
+            _whole(item, header, "NumberOfFrames") or 1,
+        )
         if frames is None:
             if count > 1:
                 raise PatientError(f"{item.name}: has {count} frames without positions")
-            return [_slice(item, None, header.get("InstanceNumber"), [header], header)]
+            return [_slice(item, None, _whole(item, header, "InstanceNumber"), [header], header)]
         if len(frames) != count:
             raise PatientError(f"{item.name}: has {count} frames and positions of {len(frames)}")
         shared = _groups((header.get("SharedFunctionalGroupsSequence") or [Dataset()])[0])
@@ -191,11 +196,11 @@ def _groups(functional: Dataset) -> list[Dataset]:
 
 
 def _slice(
-    item: SourceFile, frame: int | None, number: Any, groups: list[Dataset], header: Dataset
+    item: SourceFile, frame: int | None, number: int | None, groups: list[Dataset], header: Dataset
 ) -> DicomSlice | None:
     def value(name: str, usual: Any = None) -> Any:
-        found = (group.get(name) for group in groups if group.get(name) not in (None, ""))
-        return next(found, usual)
+        found = (_read(item, group, name) for group in groups)
+        return next((one for one in found if one not in (None, "")), usual)
 
     kind = {str(word).upper() for word in [*(value("ImageType") or []), *(value("FrameType") or [])]}
     if kind & LOCALIZERS:
@@ -206,16 +211,24 @@ def _slice(
         )
     row, column = _orientation(item, value("ImageOrientationPatient"))
     vertical, horizontal = _numbers(item, "PixelSpacing", value("PixelSpacing"), 2)
-    rows, columns = int(header.get("Rows", 0)), int(header.get("Columns", 0))
+    rows, columns = _whole(item, header, "Rows") or 0, _whole(item, header, "Columns") or 0
     if min(vertical, horizontal) <= 0 or not 2 <= rows * columns <= MOST_PIXELS:
-        raise PatientError(f"{item.name}: {columns} x {rows} pixels of {horizontal:g} x {vertical:g} mm")
-    slope, intercept = float(value("RescaleSlope", 1)), float(value("RescaleIntercept", 0))
-    if not np.isfinite([slope, intercept]).all() or slope == 0:
-        raise PatientError(f"{item.name}: RescaleSlope is {slope:g} and RescaleIntercept {intercept:g}")
+        raise PatientError(
+            f"{item.name}: Columns, Rows and PixelSpacing are those of {columns} x {rows} pixels of {horizontal:g} x {vertical:g} mm; "
+            "expected more than 0 of each"
+        )
+    slope, intercept = (
+        float(_numbers(item, name, value(name, usual), 1)[0])
+        for name, usual in (("RescaleSlope", 1), ("RescaleIntercept", 0))
+    )
+    if slope == 0:
+        raise PatientError(
+            f"{item.name}: RescaleSlope is 0; expected the HU of one step of the pixels' values"
+        )
     return DicomSlice(
         item=item,
         frame=frame,
-        number=None if number in (None, "") else int(number),
+        number=number,
         sop=str(header.get("SOPInstanceUID", "")),
         position=_numbers(item, "ImagePositionPatient", value("ImagePositionPatient"), 3),
         row=row,
@@ -231,12 +244,30 @@ def _slice(
     )
 
 
+def _read(item: SourceFile, group: Dataset, name: str) -> Any:
+    """An element's value, or None. Raises PatientError, without the text, which may name the patient."""
+    with parsing(f"{item.name}: {name} cannot be read", "expected a CT's header"):
+        return group.get(name)
+
+
+def _whole(item: SourceFile, header: Dataset, name: str) -> int | None:
+    """A whole number, or None. Raises PatientError."""
+    with parsing(f"{item.name}: {name} cannot be read", "expected a whole number"):
+        given = header.get(name)
+        return None if given in (None, "") else int(given)
+
+
 def _numbers(item: SourceFile, name: str, given: Any, count: int) -> np.ndarray:
     if given is None:
         raise PatientError(f"{item.name}: has no {name}")
-    numbers = np.array([float(n) for n in given] if isinstance(given, Iterable) else [])
-    if numbers.shape != (count,) or not np.isfinite(numbers).all():
-        raise PatientError(f"{item.name}: {name} is not {count} numbers")
+    expected = f"{count} number{'s' * (count > 1)}, none beyond {MOST:.0f}"
+    several = isinstance(given, Iterable) and not isinstance(given, str)
+    with parsing(f"{item.name}: {name} cannot be read", f"expected {expected}"):
+        numbers = np.array([float(n) for n in (given if several else [given])])
+    if numbers.shape != (count,) or not (np.abs(numbers) <= MOST).all():
+        raise PatientError(
+            f"{item.name}: {name} is {', '.join(f'{n:g}' for n in numbers[: count + 1])}; expected {expected}"
+        )
     return numbers
 
 
@@ -245,7 +276,9 @@ def _orientation(item: SourceFile, given: Any) -> tuple[np.ndarray, np.ndarray]:
     both = _numbers(item, "ImageOrientationPatient", given, 6).reshape(2, 3)
     lengths = np.linalg.norm(both, axis=1)
     if np.abs(lengths - 1).max() > 0.01 or abs(both[0] @ both[1]) > 0.01:
-        raise PatientError(f"{item.name}: ImageOrientationPatient is not two orthogonal unit vectors")
+        raise PatientError(
+            f"{item.name}: ImageOrientationPatient is {', '.join(f'{n:g}' for n in both.ravel())}; expected two orthogonal unit vectors"
+        )
     row = both[0] / lengths[0]
     column = both[1] - (both[1] @ row) * row
     return row, column / np.linalg.norm(column)

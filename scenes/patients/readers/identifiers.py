@@ -6,6 +6,7 @@ from pydicom.dataelem import DataElement
 from pydicom.dataset import Dataset
 
 from scenes.patients.readers.dicom_files import SourceFile
+from scenes.patients.readers.segment_names import is_anatomy
 
 # Value representations that identify persons, dates and objects; UI also has standard UIDs, which identify nobody.
 NAMING = ("PN", "DA", "DT", "UI")
@@ -17,8 +18,10 @@ CONTOUR_DATA = 0x30060050
 PERSONAL_KEYWORDS = (
     "Patient", "Physician", "Operator", "Institution", "Accession", "StudyID", "StudyDescription", "SeriesDescription",
     "Station", "SerialNumber", "Address", "Telephone", "Comments", "History", "Occupation", "Department", "Protocol",
-    "Requested", "Performed", "AdmissionID", "Issuer", "Reason", "Name",
+    "Requested", "Performed", "AdmissionID", "Issuer", "Reason", "Name", "SegmentLabel",
 )  # fmt: skip
+# Names of labels.
+STRUCTURES = ("ROIName", "SegmentLabel")
 
 
 def identifiers_of(item: SourceFile) -> dict[str, str]:
@@ -45,7 +48,8 @@ def _texts(data: Dataset) -> Iterator[tuple[str, str]]:
         personal = element.tag.is_private or any(word in element.keyword for word in PERSONAL_KEYWORDS)
         if element.VR in NAMING or (element.VR in FREE_TEXT and personal):
             place = f"{place} {element.keyword or '(private)'}"
-            yield from ((text, place) for text in _words(element))
+            is_structure = element.keyword in STRUCTURES and is_anatomy(str(element.value))
+            yield from ((text, place) for text in _words(element) if not is_structure)
 
 
 def _words(element: DataElement) -> Iterator[str]:

@@ -22,7 +22,13 @@ from scenes.patients.readers.label_maps import (
 )
 from scenes.patients.readers.rtstruct import read_structures
 from scenes.patients.readers.segment_codes import slicer_meaning
-from scenes.patients.readers.segment_names import is_far, side_of, tissue_of
+from scenes.patients.readers.segment_names import (
+    is_far,
+    is_needless,
+    names_that_may_identify,
+    side_of,
+    tissue_of,
+)
 from scenes.patients.readers.surface_labels import read_surfaces
 from scenes.surfaces import ENDINGS as SURFACE_ENDINGS
 from scenes.surfaces import OTHER_ENDINGS, is_surface_file
@@ -31,6 +37,7 @@ from scenes.volumes.dicom_references import DicomReferences
 from scenes.volumes.lazy_volume import LazyVolume
 from scenes.volumes.volume_files import ENDINGS, file_volume, is_volume_file
 
+NAME_OF_LABEL = "the name of a label or its file"
 SLICER_KEY = re.compile(r"Segment(\d+)_Name$")
 
 
@@ -139,9 +146,19 @@ def _label_map_file(path: Path) -> Segmentation:
     stem = _stem(path)
     if not names and len(maps[0].segments) == len(maps) == 1 and (tissue_of(stem) or side_of(stem)):
         (value,) = maps[0].segments
-        maps = [replace(maps[0], segments={value: Segment.named(stem, value)})]
+        segment = Segment.named(stem, value)
+        # A name with a side alone says no more than none: the kidney.
+        is_kidney = not segment.is_understood and not is_needless(stem)
+        maps = [
+            replace(maps[0], segments={value: replace(segment, tissue="kidney") if is_kidney else segment})
+        ]
+    called = [segment.name for one in maps for segment in one.segments.values()]
+    called += [segment.name for segment in unused.values()]
     return Segmentation(
-        lambda _: maps, identifiers=volume.identifiers, grid=volume.grid, empty=tuple(unused.values())
+        lambda _: maps,
+        identifiers={**volume.identifiers, **names_that_may_identify(called, NAME_OF_LABEL)},
+        grid=volume.grid,
+        empty=tuple(unused.values()),
     )
 
 
@@ -177,7 +194,7 @@ def _file_per_organ(
     near.sort(key=lambda file: tissue_of(_stem(file)) != "kidney")
     maps: list[LabelMap] = []
     empty: list[Segment] = []
-    identifiers: dict[str, str] = {}
+    identifiers = names_that_may_identify(map(_stem, files), NAME_OF_LABEL)
     around: np.ndarray | None = None
     for file in progress(near, "labels"):
         volume = file_volume(file)

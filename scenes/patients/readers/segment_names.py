@@ -1,6 +1,7 @@
 """Recognise the tissue and the side of a segment by its name."""
 
 import re
+from collections.abc import Iterable
 from typing import Literal
 
 Side = Literal["left", "right"]
@@ -35,6 +36,11 @@ OUTLINE = (
     r"^(whole |outer )?(body|skin|patient|external|outline|contour)( (contour|outline|surface|skin))?( \d+)?$|couch|"
     r"\btable ?(top)?$|^mattress"
 )
+# Words that are in names of structures, and mean none alone.
+BESIDE_STRUCTURES = (
+    r"\b(and|of|the|gland|lobe|upper|middle|lower|small|large|inferior|superior|cava|portal|splenic|maximus|medius|minimus|cartilages?|"
+    r"[ctls]\d+|segment|label)\b"
+)
 SIDE_OF_NAME: tuple[tuple[Side, str], ...] = (
     ("left", r"\b(left|lt|l|links|gauche|sinister|sinistra)\b"),
     ("right", r"\b(right|rt|r|rechts|droite?|dexter|dextra)\b"),
@@ -61,6 +67,27 @@ def is_far(name: str) -> bool:
 def is_needless(name: str) -> bool:
     """Whether a name is of a structure that an import does not need: far from the kidneys, the body's outline, a couch."""
     return is_far(name) or re.search(OUTLINE, _plain(name)) is not None
+
+
+def is_anatomy(text: str) -> bool:
+    """Whether all words of a text are of structures and sides, which identify nobody; short numbers are no words."""
+    plain = _plain(text)
+    patterns = [
+        *(pattern for _, pattern in (*TISSUE_OF_NAME, *SIDE_OF_NAME)),
+        FAR,
+        OUTLINE,
+        BESIDE_STRUCTURES,
+    ]
+    known = [found.span() for pattern in patterns for found in re.finditer(pattern, plain)]
+    return all(
+        any(start < word.end() and word.start() < end for start, end in known)
+        for word in re.finditer(r"[^\W\d_]+|\d{4,}", plain)
+    )
+
+
+def names_that_may_identify(names: Iterable[str], place: str) -> dict[str, str]:
+    """The names that have other words than structures and sides, such as the patient's, and where they stand."""
+    return {name: place for name in names if not is_anatomy(name)}
 
 
 def side_of(name: str) -> Side | None:

@@ -106,9 +106,13 @@ def _check_same_geometry(name: str, slices: list[DicomSlice]) -> None:
         scaled = np.abs(np.subtract(other.spacing, first.spacing)).max() > 1e-3 * first.spacing[0]
         if turned > PARALLEL or scaled or (other.rows, other.columns) != (first.rows, first.columns):
             what = "orientation" if turned > PARALLEL else "pixel spacing" if scaled else "size"
+            pixels = " and ".join(
+                f"{one.columns} x {one.rows} pixels of {one.spacing[0]:.3g} x {one.spacing[1]:.3g} mm"
+                for one in (first, other)
+            )
             raise PatientError(
-                f"{name}: {first.label} and {other.label} are of different {what}; expected one stack of parallel "
-                "slices; put the slices of one view in a separate folder"
+                f"{name}: {first.label} and {other.label} are of different {what}: {pixels}; expected one stack of parallel "
+                "slices; put the slices of one view in a separate folder, or export the series again"
             )
 
 

@@ -1,6 +1,5 @@
 """Read closed surfaces (STL, PLY, OBJ) as labels: one structure a file, voxels where the surface is wound around their centre."""
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import trimesh
 
 from errors import PatientError
 from scenes.patients.readers.label_maps import LabelMap, Segment, Segmentation
-from scenes.patients.readers.segment_names import is_understood
+from scenes.patients.readers.segment_names import names_that_may_identify
 from scenes.surfaces import SPACE_FIELD, Space, file_comments, in_lps, read_triangles, stated_space
 from scenes.terminal import Progress
 from scenes.volumes.voxel_grid import VoxelGrid
@@ -46,7 +45,6 @@ def read_surfaces(files: Sequence[Path], near_mm: float, progress: Progress) -> 
     spaces = {file: stated_space(file) for file in files}
     surfaces = {file: in_lps(_closed(file), spaces[file]) for file in progress(files, "surfaces")}
     texts = [SPACE_FIELD.sub("", text).strip() for file in files for text in file_comments(file)]
-    own = [text for text in texts if not _is_anatomy(text)]
 
     def maps(ct: VoxelGrid) -> list[LabelMap]:
         for file, surface in surfaces.items():
@@ -65,13 +63,9 @@ def read_surfaces(files: Sequence[Path], near_mm: float, progress: Progress) -> 
     return Segmentation(
         maps,
         notes=(f"surfaces that state no coordinate system were taken as LPS: {assumed}",) if assumed else (),
-        identifiers=dict.fromkeys(own, "the comment in a surface's file"),
+        identifiers=names_that_may_identify(texts, "the comment in a surface's file")
+        | names_that_may_identify((file.stem for file in files), "the name of a surface's file"),
     )
-
-
-def _is_anatomy(text: str) -> bool:
-    """Whether all words of a comment are structures, which identify nobody."""
-    return all(is_understood(word) for word in re.findall(r"\w+", text))
 
 
 def _closed(file: Path) -> trimesh.Trimesh:
