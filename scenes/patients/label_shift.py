@@ -10,6 +10,7 @@ import numpy as np
 import SimpleITK as sitk
 from scipy import ndimage
 
+from scenes.patients.patient_directions import components
 from scenes.volumes.voxel_grid import VoxelGrid
 
 LATTICE_MM, STEPS = 2.0, 5  # a best fit at the border is none: shifts of up to 8 mm are found
@@ -21,12 +22,6 @@ WEAK_EDGE = 0.1
 LEAST_MM, LEAST_VOXELS = 2.5, 0.5
 # Agreement is 1 where all of the outline is on an edge of the organ in the CT, and 0 by chance.
 LEAST_AGREEMENT, LEAST_GAIN = 0.3, 1.05
-NAMED_SHARE = 0.35  # smaller components of a shift are not named
-TOWARDS = (
-    ("to the patient's right", "to the patient's left"),
-    ("to the front", "to the back"),
-    ("to the feet", "to the head"),
-)
 
 
 def shift_warnings(
@@ -41,11 +36,7 @@ def shift_warnings(
     half_voxel = LEAST_VOXELS * float(np.abs(shift @ grid.direction) @ grid.spacing) / max(length, 1e-9)
     if length < max(LEAST_MM, half_voxel):
         return ()
-    ways = [
-        f"{abs(mm):.0f} mm {towards[int(mm > 0)]}"
-        for mm, towards in zip(shift, TOWARDS, strict=True)
-        if abs(mm) >= NAMED_SHARE * length
-    ]
+    ways = [f"{mm:.0f} mm {words}" for mm, words in components(shift)]
     return (
         f"the labels fit the CT better when moved by {' and '.join(ways)}; they may be shifted, or of another series; compare the "
         "outlines in check.png, and export CT and labels again",

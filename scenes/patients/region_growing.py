@@ -1,8 +1,9 @@
 """Draft segmentation of a kidney without labels: region growing from a seed, for the user to check.
 
 No threshold separates every kidney from its neighbours, so several HU bands are tried, each with openings of several
-radii. The region most like a kidney is returned: convex, with an edge in HU along its surface. If none is plausible, the
-seed is refused with the reason.
+radii. The region most like a kidney is returned: convex, with an edge in HU along its surface. The bands are tried a second
+time around the HU of that region, so that the HU at the seed matter less. If no region is plausible, the seed is refused with
+the reason.
 """
 
 from collections.abc import Iterator
@@ -10,9 +11,10 @@ from collections.abc import Iterator
 import numpy as np
 import SimpleITK as sitk
 from scipy import ndimage
-from scipy.spatial import ConvexHull
 
 from errors import PatientError
+from scenes.patients.kidney_regions import FAT_HU, LEAST_EDGE, LEAST_SOLIDITY, Region
+from scenes.patients.patient_directions import components
 from scenes.patients.readers.label_maps import LabelMap, Segment, box_of
 from scenes.volumes.lazy_volume import LazyVolume
 from scenes.volumes.voxel_grid import VoxelGrid
@@ -22,20 +24,19 @@ REACH_MM = 110.0  # around the seed: a kidney is 9 to 13 cm long and the seed ma
 WORKING_MM = 2.0
 VOXEL_ML = WORKING_MM**3 / 1000.0
 PARENCHYMA_HU = (-10.0, 350.0)  # from unenhanced and noisy to pyramids in the excretory phase
-AIR_BELOW_HU, FAT_HU = -200.0, -100.0
+AIR_BELOW_HU = -200.0
 # Lower threshold of a region, between fat and seed: low where fat surrounds it, high where muscle, liver or spleen touches.
 LOW_SHARES = (0.45, 0.55, 0.65, 0.75, 0.85, 0.92)
+SAME_LEVEL = 0.05  # half a step of these shares
 ABOVE_SEED_HU = 150.0  # from a seed in the medulla to the cortex
 UNENHANCED_HU = 90.0  # below it the neighbours are brighter
 NARROW_LOW_SHARES, NARROW_ABOVE_HU = (0.55, 0.75), (15.0, 25.0, 40.0)
 OPENINGS, CLOSING = (2, 3, 4, 6), 2  # radii in voxels of WORKING_MM
 SEED_BALL_MM, OFF_SEED_MM = 4.5, 6.0
 VOLUME_ML = (40.0, 450.0)
-# A surface point is on an edge where the HU 2 to 4 mm outside differ by this share of the region's contrast to fat.
-EDGE_SHARE = 0.25
-# The kidneys of the development data are above both; spleen and kidney in one region are below the second.
-LEAST_EDGE, LEAST_SOLIDITY = 0.75, 0.65
-ELSEWHERE = "give a point deeper in the parenchyma, or draw labels"
+ONE_SIDE_MM = 15.0  # what touches a region has its middle farther out, unless it is all around
+BORDER = f"the border of the CT, or {REACH_MM:g} mm from the seed"
+ELSEWHERE = "if the seed is in a kidney, give a point farther from there, or draw labels"
 
 
 def draft_segmentation(ct: LazyVolume, seed_mm: np.ndarray) -> LabelMap:
@@ -86,25 +87,47 @@ def _working(image: sitk.Image) -> sitk.Image:
 
 
 def _most_like_a_kidney(tissue: sitk.Image, seed: np.ndarray) -> np.ndarray:
-    """The best region (z, y, x). Raises PatientError where it is not plausible."""
+    """The best region (z, y, x). Raises PatientError where it is not like a kidney."""
     hounsfield = sitk.GetArrayFromImage(tissue)
-    index = np.rint(VoxelGrid.of(tissue).index(seed[None])[0]).astype(int)
-    start = np.clip(index, 0, np.array(tissue.GetSize()) - 1)
+    start = _start(tissue, hounsfield, seed)
     away = _distance(hounsfield, start)
-    level = float(np.median(hounsfield[away <= SEED_BALL_MM]))
-    _check_parenchyma(level, seed)
-    found = [one for low, high in _bands(level) for one in _opened_regions(tissue, away, low, high)]
-    shapes = [(*_shape(inside, hounsfield), inside) for inside in found if _is_plausible(inside)]
-    if not shapes:
-        raise _refusal(seed, _why_none(found))
-    edge, solidity, best = max(shapes, key=lambda shape: shape[0] * shape[1] ** 0.5)
-    if edge < LEAST_EDGE or solidity < LEAST_SOLIDITY:
-        raise _refusal(
-            seed,
-            f"the region of {_ml(best):.0f} ml fills {solidity:.0%} of its convex hull and has an edge on "
-            f"{edge:.0%} of its surface, where a kidney has at least {LEAST_SOLIDITY:.0%} and {LEAST_EDGE:.0%}",
-        )
-    return best
+    level = _level(hounsfield, away)
+    found, regions = _grown(tissue, hounsfield, away, level)
+    if regions:
+        first = max(regions, key=lambda region: region.rank)
+        # A seed near the surface, in a pyramid or in noise has not the HU of the organ.
+        organ = float(np.median(hounsfield[first.inside]))
+        if abs(organ - level) > SAME_LEVEL * (level - FAT_HU):
+            _, again = _grown(tissue, hounsfield, _distance(hounsfield, first.deepest()), organ)
+            regions += [region for region in again if away[region.inside].min() <= OFF_SEED_MM]
+    best = max(regions, key=lambda region: region.rank, default=None)
+    if best is None or not (best.is_kidney and best.is_whole):
+        raise _refusal(seed, *_why_none(VoxelGrid.of(tissue), hounsfield, start, found, regions))
+    return best.inside
+
+
+def _start(tissue: sitk.Image, hounsfield: np.ndarray, seed: np.ndarray) -> np.ndarray:
+    """The voxel (x, y, z) near the seed with the most soft tissue around it. Raises PatientError: the seed is in none.
+
+    In thick voxels, the cortex near the surface has the HU of the fat beside it.
+    """
+    index = np.rint(VoxelGrid.of(tissue).index(seed[None])[0]).astype(int)
+    at = np.clip(index, 0, np.array(tissue.GetSize()) - 1)
+    away = _distance(hounsfield, at)
+    least, most = PARENCHYMA_HU
+    soft = ((hounsfield >= least) & (hounsfield <= most)).astype(np.float32)
+    # Of equal ones the nearest: no distance outweighs one voxel of the 27.
+    share = np.where(away <= OFF_SEED_MM, ndimage.uniform_filter(soft, 3) - away / 1000, -1.0)
+    start = np.array(np.unravel_index(np.argmax(share), share.shape))[::-1]
+    level, here = _level(hounsfield, _distance(hounsfield, start)), float(hounsfield[tuple(at[::-1])])
+    # Less than half of the seed's own voxel is the tissue beside it.
+    is_beside = here > most or here < 0.5 * (FAT_HU + level)
+    _check_parenchyma(here if is_beside else level, seed)
+    return start
+
+
+def _level(hounsfield: np.ndarray, away: np.ndarray) -> float:
+    return float(np.median(hounsfield[away <= SEED_BALL_MM]))
 
 
 def _distance(voxels: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -127,6 +150,15 @@ def _bands(level: float) -> list[tuple[float, float]]:
     if level < UNENHANCED_HU:
         shares += [(share, above) for share in NARROW_LOW_SHARES for above in NARROW_ABOVE_HU]
     return [(FAT_HU + share * (level - FAT_HU), level + above) for share, above in shares]
+
+
+def _grown(
+    tissue: sitk.Image, hounsfield: np.ndarray, away: np.ndarray, level: float
+) -> tuple[list[np.ndarray], list[Region]]:
+    """All regions (z, y, x) around a start, and those with the volume of a kidney."""
+    found = [inside for low, high in _bands(level) for inside in _opened_regions(tissue, away, low, high)]
+    least, most = VOLUME_ML
+    return found, [Region.of(inside, hounsfield) for inside in found if least <= _ml(inside) <= most]
 
 
 def _opened_regions(tissue: sitk.Image, away: np.ndarray, low: float, high: float) -> Iterator[np.ndarray]:
@@ -170,28 +202,50 @@ def _ml(inside: np.ndarray) -> float:
     return np.count_nonzero(inside) * VOXEL_ML
 
 
-def _is_plausible(inside: np.ndarray) -> bool:
-    """Whether a region has a kidney's volume and does not touch the border."""
-    cut = any(inside.take(end, axis).any() for axis in range(3) for end in (0, -1))
-    return not cut and VOLUME_ML[0] <= _ml(inside) <= VOLUME_ML[1]
+def _why_none(
+    grid: VoxelGrid, hounsfield: np.ndarray, start: np.ndarray, found: list[np.ndarray], regions: list[Region]
+) -> tuple[str, str]:
+    """What was found instead of a kidney, and what to do."""
+    if any(region.is_kidney for region in regions):
+        advice = "give a point in the kidney, or choose a CT that shows all of it"
+        return f"the region is cut off at {BORDER}", advice
+    whole = [region for region in regions if region.is_whole]
+    if whole:
+        return _why_unlike(grid, max(whole, key=lambda region: region.rank)), ELSEWHERE
+    large = [inside for inside in found if _ml(inside) >= VOLUME_ML[0]]
+    if large:
+        return _where_it_leaks(grid, hounsfield, start, min(large, key=_ml)), ELSEWHERE
+    most = max(map(_ml, found), default=0.0)
+    advice = "give a point in the parenchyma, not in a cyst, tumour or vessel, or draw labels"
+    return f"the region has only {most:.0f} ml, where a kidney has at least {VOLUME_ML[0]:g}", advice
 
 
-def _shape(inside: np.ndarray, hounsfield: np.ndarray) -> tuple[float, float]:
-    """Share of a region's surface on an edge, and share of its convex hull that it fills (solidity)."""
-    near = ndimage.binary_dilation(inside)
-    around = hounsfield[ndimage.binary_dilation(near) & ~near]
-    middle = float(np.median(hounsfield[inside]))
-    edge = np.abs(around - middle) > EDGE_SHARE * (middle - FAT_HU)
-    hull = ConvexHull(np.argwhere(inside & ~ndimage.binary_erosion(inside)))
-    # The hull of the voxel centres is half a voxel inside that of the voxels.
-    return float(edge.mean()), float(np.count_nonzero(inside) / (hull.volume + 0.5 * hull.area))
+def _why_unlike(grid: VoxelGrid, region: Region) -> str:
+    shape = f"the region of {_ml(region.inside):.0f} ml "
+    if region.edge >= LEAST_EDGE:
+        return (
+            f"{shape}fills {region.solidity:.0%} of its convex hull, where a kidney fills at least {LEAST_SOLIDITY:.0%}; it may be "
+            "two organs"
+        )
+    return (
+        f"{shape}has an edge on {region.edge:.0%} of its surface, where a kidney has at least {LEAST_EDGE:.0%}; "
+        f"{_towards(grid, region.open_side)}, tissue of like HU touches it"
+    )
 
 
-def _why_none(found: list[np.ndarray]) -> str:
-    largest = max((_ml(inside) for inside in found), default=0.0)
-    if largest < VOLUME_ML[0]:
-        return f"the region has only {largest:.0f} ml, where a kidney has at least {VOLUME_ML[0]:g}"
-    return f"the region leaks beyond {VOLUME_ML[1]:g} ml or to the CT's border"
+def _where_it_leaks(grid: VoxelGrid, hounsfield: np.ndarray, start: np.ndarray, leak: np.ndarray) -> str:
+    away = np.argwhere(leak).mean(axis=0)[::-1] - start
+    to = f"{_ml(leak):.0f} ml" if _ml(leak) > VOLUME_ML[1] else BORDER
+    return (
+        f"the region goes on {_towards(grid, away)} into tissue of {np.median(hounsfield[leak]):.0f} HU, to {to}, where a kidney has "
+        f"at most {VOLUME_ML[1]:g} ml"
+    )
+
+
+def _towards(grid: VoxelGrid, steps: np.ndarray) -> str:
+    if np.linalg.norm(steps) * WORKING_MM < ONE_SIDE_MM:
+        return "all around"
+    return " and ".join(words for _, words in components(grid.direction @ steps))
 
 
 def _refusal(seed: np.ndarray, found: str, advice: str = ELSEWHERE) -> PatientError:
