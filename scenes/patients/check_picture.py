@@ -19,10 +19,10 @@ from skimage.color import rgb2lab
 
 from scenes.patients.organ_selection import HILAR
 from scenes.patients.part_surfaces import PARTS, PEDICLE_MM
-from scenes.patients.patient_complexity import complexity_of_patient
 from scenes.patients.patient_import import Patient
 from scenes.patients.patient_position import LYING
 from scenes.patients.readers.label_maps import Colour
+from scenes.tumour_complexity import Complexity
 from scenes.volumes.lazy_volume import AIR_HU
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -83,7 +83,7 @@ VIEWS = (
 OVERVIEW = CheckView("coronal, full width", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I"))
 
 
-def summary_rows(patient: Patient) -> list[tuple[str, str]]:
+def summary_rows(patient: Patient, complexity: Complexity | None = None) -> list[tuple[str, str]]:
     """The summary for the terminal and the check image: a title and a line each, without names, dates or paths."""
     volumes = patient.volumes_ml
     size = " x ".join(str(n) for n in patient.ct.GetSize())
@@ -102,8 +102,7 @@ def summary_rows(patient: Patient) -> list[tuple[str, str]]:
             rows.append((word, f"{volumes[tissue]:.1f} ml, {len(patient.parts[tissue].faces)} faces{where}"))
         elif tissue == "tumour":
             rows.append((word, "none labelled as one"))
-    found = complexity_of_patient(patient)
-    rows += [] if found is None else found.rows()
+    rows += [] if complexity is None else complexity.rows()
     rows.append(("support", f"{len(patient.support.faces)} faces, for a patient {LYING[patient.position]}"))
     rows.append(("CT", f"{size} voxels of {spacing} mm"))
     return rows + [("note", note) for note in patient.notes]

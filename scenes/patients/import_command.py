@@ -88,6 +88,7 @@ def import_patient_command(
     # Matplotlib and highdicom take 0.5 s to import.
     from scenes.patients.check_picture import as_table, draw_check, summary_rows
     from scenes.patients.import_request import import_request
+    from scenes.patients.patient_complexity import complexity_of_patient
     from scenes.patients.patient_findings import findings_of
     from scenes.patients.patient_scene import patient_scene
 
@@ -98,10 +99,11 @@ def import_patient_command(
         ct, labels, own, tissues, side, series, seed_place, support, position, bar
     )
     patient = without_identifiers(patient, identifiers)
-    rows = summary_rows(patient)
+    complexity = complexity_of_patient(patient)
+    rows = summary_rows(patient, complexity)
     texts = {
         "scene.toml": scene_text(patient_scene(patient)),
-        FINDINGS_FILE: findings_text(findings_of(patient)),
+        FINDINGS_FILE: findings_text(findings_of(patient, complexity)),
     }
     searched = save_patient(
         patient, out, texts, lambda folder: draw_check(patient, rows, folder), identifiers

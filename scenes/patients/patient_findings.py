@@ -1,17 +1,16 @@
 """The findings of an imported patient, for ``import.json``."""
 
 from scenes.import_findings import GridFindings, ImportFindings, ImportWarning, SurfaceFindings
-from scenes.patients.patient_complexity import complexity_of_patient
 from scenes.patients.patient_import import Patient
+from scenes.tumour_complexity import Complexity
 from scenes.volumes.voxel_grid import VoxelGrid
 from version import VERSION
 
 DIGITS = 4
 
 
-def findings_of(patient: Patient) -> ImportFindings:
+def findings_of(patient: Patient, complexity: Complexity | None) -> ImportFindings:
     """What the import of a patient found; its warnings are not acknowledged."""
-    found = complexity_of_patient(patient)
     surfaces = {"organ": patient.organ, **patient.parts, "support": patient.support}
     return ImportFindings(
         version=VERSION,
@@ -31,7 +30,7 @@ def findings_of(patient: Patient) -> ImportFindings:
         source=_grid(patient.source),
         ct=_grid(VoxelGrid.of(patient.ct)),
         tissues={str(code): tissue for code, tissue in patient.tissues.items()},
-        complexity=None if found is None else found.figures(),
+        complexity=None if complexity is None else complexity.figures(),
         warnings=tuple(ImportWarning(text=text) for text in patient.warnings),
         notes=patient.notes,
     )

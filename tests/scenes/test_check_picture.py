@@ -20,6 +20,7 @@ from scenes.patients.check_picture import (
     summary_rows,
 )
 from scenes.patients.part_surfaces import PARTS
+from scenes.patients.patient_complexity import complexity_of_patient
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.label_maps import LabelMap
 from scenes.volumes.lazy_volume import LazyVolume
@@ -200,9 +201,11 @@ def test_long_text_ends_above_the_names_of_the_colours(patient, tmp_path):
 
 def test_the_complexity_of_the_tumour_is_in_the_summary(patient):
     """The tumour is a ball of 11 mm that protrudes half from the left kidney, towards the front and the head."""
-    rows = dict(summary_rows(patient))
+    rows = dict(summary_rows(patient, complexity_of_patient(patient)))
     assert rows["size"].startswith("2") and "exophytic" in rows["size"]
     assert "R 1 (2" in rows["R.E.N.A.L."] and "N 1-3" in rows["R.E.N.A.L."] and "size 1" in rows["PADUA"]
     assert "label the collecting system, renal sinus" in rows["not known"]
-    without = dict(summary_rows(replace(patient, parts={})))
+    without = dict(
+        summary_rows(replace(patient, parts={}), complexity_of_patient(replace(patient, parts={})))
+    )
     assert not {"size", "R.E.N.A.L.", "PADUA", "not known"} & set(without)
