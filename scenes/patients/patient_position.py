@@ -40,7 +40,7 @@ OF_TERM: dict[str, Position] = {
 }
 
 # The grid on which a CT is searched: millimetres along LPS.
-GRID_MM = np.array([2.5, 2.5, 5.0])
+GRID_MM = np.array([2.5, 2.5, 10.0])
 BODY_ABOVE_HU, GAS_BELOW_HU, LUNG_ABOVE_HU, FLUID_ABOVE_HU = -300, -600, -900, -200
 # Shells and cushions of a table.
 TABLE_ABOVE_HU = -500

@@ -20,7 +20,7 @@ from scenes.anatomy import load_anatomy
 from scenes.import_findings import read_findings
 from scenes.patients.import_command import position_mm
 from scenes.patients.import_request import import_request, volume_of_labels
-from scenes.patients.patient_folder import is_identifying, save_patient, without_identifiers
+from scenes.patients.patient_folder import MANY, is_identifying, save_patient, without_identifiers
 from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.dicom_files import SourceFile
 from scenes.patients.readers.identifiers import identifiers_of
@@ -445,13 +445,15 @@ class TestSearch:
 
     @pytest.mark.parametrize("encoding", ["ascii", "utf-16-le"])
     @pytest.mark.parametrize("around", [b"\0", b"7", b"7\0", b"A", b"."])
-    def test_uids_between_other_bytes(self, taken_in, tmp_path, encoding, around):
+    @pytest.mark.parametrize("others", [0, MANY])
+    def test_uids_between_other_bytes(self, taken_in, tmp_path, encoding, around, others):
         def draw(folder):
             (folder / "check.png").write_bytes(around + "1.2.826.0.17".encode(encoding) + around)
 
         for uid, is_there in (("1.2.826.0.17", True), ("1.2.826.0.19", False)):
             try:
-                save_patient(taken_in[0], tmp_path / uid, draw=draw, identifiers={uid: "a UID"})
+                uids = dict.fromkeys([uid, *(f"1.2.840.4711.{n}" for n in range(others))], "a UID")
+                save_patient(taken_in[0], tmp_path / uid, draw=draw, identifiers=uids)
                 assert not is_there
             except PatientError:
                 assert is_there

@@ -5,7 +5,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from pydicom.dataset import Dataset
-from pydicom.sr.coding import Code
 
 from scenes.patients.readers.segment_names import Side, is_understood, side_of, tissue_of
 
@@ -102,5 +101,7 @@ def _item_words(item: Dataset) -> str:
 
 def _words(scheme: str, value: str, meaning: str) -> str:
     """The words of a code, those of its meaning where it is not known here."""
+    from pydicom.sr.coding import Code  # takes 50 ms: few imports have codes
+
     code = Code(value, "SRT" if scheme in RT_SCHEMES else scheme, meaning)
     return next((words for known, words in WORDS.items() if code == Code(known, "SCT", "")), meaning)
