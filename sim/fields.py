@@ -56,6 +56,8 @@ class FieldSet:
 
     def free(self) -> None:
         """Free the fields, which must not be used any more."""
+        # Taichi checks new fields when it next runs a kernel, and would read the memory of the freed ones.
+        impl.get_runtime().materialize()
         for tree in self._trees:
             _ROOTS.get(impl.get_runtime(), {}).pop(tree.id, None)
             tree.destroy()
