@@ -111,6 +111,16 @@ class TestSynthetic:
         grid = VoxelGrid.of(ct)
         assert dice(placed(found, grid), placed(expected, grid)) > 1 - 0.5 * ONE_VOXEL
 
+    def test_from_a_pyramid_as_dark_as_the_liver_the_liver_is_left_out(self):
+        """The bands of the pyramid hold the liver; those of the whole organ, which are tried then, do not."""
+        pyramid = CENTRE, np.array([9.0, 9.0, 9.0])
+        ct = scanned([(55.0, PSOAS), (80.0, WRAPPED), (150.0, KIDNEY), (80.0, pyramid)], 15.0)
+        truth = level(points_of(ct), KIDNEY) < 0
+        assert (
+            dice(placed(draft_segmentation(LazyVolume.of(ct), CENTRE), VoxelGrid.of(ct)), truth)
+            > 1 - ONE_VOXEL
+        )
+
     def test_sinus_that_opens_to_the_outside_is_filled(self):
         sinus = CENTRE, np.array([8.0, 8.0, 12.0])
         hilum = CENTRE + [-20.0, 0.0, 0.0], np.array([20.0, 3.0, 3.0])
@@ -154,6 +164,7 @@ class TestRefused:
             (np.array([np.nan, 0.0, 0.0]), "outside the CT"),
             (GAS[0], "in air, -"),
             (CENTRE + [-10.0, -40.0, -40.0], "in fat, -"),
+            (CENTRE + [KIDNEY[1][0] + 4.0, 0.0, 0.0], "in fat, -"),  # the kidney is near
             (RIB[0], "in bone"),
             (VESSEL[0] + [0.0, 0.0, -40.0], "goes on .* into tissue of 1[0-9]+ HU"),
             (PSOAS[0], "cut off at the border"),
@@ -170,12 +181,13 @@ class TestRefused:
             "goes on to the front and to the head into tissue of 105 HU",
         )
 
-    def test_liver_that_is_hardly_darker_is_told_by_its_side(self):
-        ct = scanned([(112.0, WRAPPED), (140.0, KIDNEY)])
+    @pytest.mark.parametrize("direction", ["identity", "slices first"])
+    def test_liver_that_is_hardly_darker_is_told_by_its_side(self, direction):
+        ct = scanned([(112.0, WRAPPED), (140.0, KIDNEY)], direction=direction)
         refused(
             ct,
             CENTRE,
-            "edge on [78][0-9]% of its surface.*; to the patient's left and .*tissue of like HU.*farther from there",
+            "edge on [78][0-9]% of its surface.*; to the patient's left and to the head, tissue of like HU.*farther from there",
         )
 
     def test_kidney_in_one_with_its_neighbours(self):
