@@ -1,4 +1,7 @@
-"""Copy arrays to and from Taichi fields. On a CPU directly in memory: compiling a kernel for each field takes longer."""
+"""Copy arrays to and from Taichi fields. On a CPU directly in memory: compiling a kernel for each field takes longer.
+
+New fields get their values together, before the next kernel or access: so they share trees, and one kernel finds where these are.
+"""
 
 import ctypes
 from collections.abc import Callable, Sequence
@@ -13,6 +16,8 @@ from sim.device import on_cpu
 # Address of each tree of fields, for each start of Taichi; and the memory of each field.
 _ROOTS: WeakKeyDictionary[object, dict[int, int]] = WeakKeyDictionary()
 _VIEWS: WeakKeyDictionary[ti.Field, np.ndarray] = WeakKeyDictionary()
+# Values for new fields, for each start of Taichi.
+_WAITING: WeakKeyDictionary[object, list[tuple[ti.Field, np.ndarray]]] = WeakKeyDictionary()
 # The sets of fields that are entered, the innermost last.
 _ENTERED: "list[FieldSet]" = []
 
@@ -86,10 +91,12 @@ def fill(*pairs: tuple[ti.Field, np.ndarray]) -> None:
         values = np.asarray(values)
         if values.shape != _shape(field):
             raise ValueError(f"an array of shape {values.shape} for a field of shape {_shape(field)}")
-        if on_cpu():
+        if not on_cpu():
+            field.from_numpy(np.ascontiguousarray(values, _kind(field)))
+        elif field in _VIEWS:
             _memory(field)[...] = values
         else:
-            field.from_numpy(np.ascontiguousarray(values, _kind(field)))
+            _WAITING.setdefault(impl.get_runtime(), []).append((field, values.copy()))
 
 
 def fill_evenly(field: ti.Field, value: float) -> None:
@@ -136,10 +143,14 @@ def _memory(field: ti.Field) -> np.ndarray:
 
 
 def _view(field: ti.Field) -> np.ndarray:
+    # This may fill the field, and so make its view.
     impl.get_runtime().materialize()
+    if field in _VIEWS:
+        return _VIEWS[field]
+    _find_roots([field])
     place = field.snode.ptr
     size = place.parent.cell_size_bytes
-    at = _root(field) + place.parent.offset_bytes_in_parent_cell
+    at = _ROOTS[impl.get_runtime()][place.get_snode_tree_id()] + place.parent.offset_bytes_in_parent_cell
     memory = (ctypes.c_byte * (size * int(np.prod(field.shape)))).from_address(at)
     strides = _strides(field.shape, size) + _strides(_element(field), np.dtype(_kind(field)).itemsize)
     return np.ndarray(_shape(field), _kind(field), memory, place.offset_bytes_in_parent_cell, strides)
@@ -149,15 +160,44 @@ def _strides(shape: tuple[int, ...], size: int) -> tuple[int, ...]:
     return tuple(size * int(np.prod(shape[axis + 1 :])) for axis in range(len(shape)))
 
 
-def _root(field: ti.Field) -> int:
-    roots, place = _ROOTS.setdefault(impl.get_runtime(), {}), field.snode.ptr
-    tree = place.get_snode_tree_id()
-    if tree not in roots:
-        before = place.parent.offset_bytes_in_parent_cell + place.offset_bytes_in_parent_cell
-        roots[tree] = _address(field, len(field.shape)) - before
-    return roots[tree]
+def _find_roots(fields: Sequence[ti.Field]) -> None:
+    """Find the addresses of the trees of fields, of those that are not known yet."""
+    roots = _ROOTS.setdefault(impl.get_runtime(), {})
+    of_tree = {field.snode.ptr.get_snode_tree_id(): field for field in fields}
+    new = {tree: field for tree, field in of_tree.items() if tree not in roots}
+    if new:
+        asked, found = _Asked(list(new.values())), np.zeros(len(new), np.uint64)
+        _addresses(asked, found)
+        # Taichi keeps the argument.
+        asked.fields.clear()
+        for (tree, field), address in zip(new.items(), found, strict=True):
+            place = field.snode.ptr
+            before = place.parent.offset_bytes_in_parent_cell + place.offset_bytes_in_parent_cell
+            roots[tree] = int(address) - before
+
+
+class _Asked:
+    """The fields of one call of a kernel."""
+
+    def __init__(self, fields: list[ti.Field]) -> None:
+        self.fields = fields
 
 
 @ti.kernel
-def _address(field: ti.template(), axes: ti.template()) -> ti.u64:
-    return ti.get_addr(field, [0 for _ in ti.static(range(axes))])
+def _addresses(of: ti.template(), found: ti.types.ndarray(ti.u64, ndim=1)):
+    for k in ti.static(range(len(of.fields))):
+        found[k] = ti.get_addr(of.fields[k], [0 for _ in ti.static(range(len(of.fields[k].shape)))])
+
+
+def _materialize_and_fill(runtime: impl.PyTaichi) -> None:
+    _materialize(runtime)
+    waiting = _WAITING.pop(runtime, [])
+    if waiting:
+        _find_roots([field for field, _ in waiting])
+        for field, values in waiting:
+            _memory(field)[...] = values
+
+
+# Taichi calls this before it builds a kernel or reads an element: what uses a new field does so first.
+_materialize = impl.PyTaichi.materialize
+impl.PyTaichi.materialize = _materialize_and_fill
