@@ -5,9 +5,11 @@ to the marked side, y elevation, z along its axis; the image leaves its face at 
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import igl
 import numpy as np
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation, Slerp
 
 # Radius of the surface patch to whose mean normal the probe is aligned.
@@ -212,15 +214,29 @@ class ProbeManipulator:
 
     def surface_normal(self, point: np.ndarray) -> np.ndarray:
         """Return the unit normal (3,) of the surface patch around a point [mm]."""
-        distance = np.linalg.norm(self.vertices - point, axis=1)
-        normal = np.exp(-((distance / NORMAL_PATCH_MM) ** 2)) @ self.normals
-        return normal / np.linalg.norm(normal)
+        return self.surface_normals(point[None])[0]
+
+    def surface_normals(self, points: np.ndarray) -> np.ndarray:
+        """Return the unit normals (n, 3) of the surface patches around points (n, 3) [mm]."""
+        normal = np.exp(-((cdist(points, self.vertices) / NORMAL_PATCH_MM) ** 2)) @ self.normals
+        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def ray_hit(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
         """Return the first intersection (3,) of a ray [mm] with the settled organ, None where it misses."""
-        # Not its first=True, which reports a hit where there is none.
-        hits = igl.ray_mesh_intersect(np.array(origin), np.array(direction), self.vertices, self.faces)
-        return np.array(origin) + hits[0][1] * np.array(direction) if hits else None
+        origin, direction = np.array(origin, float), np.array(direction, float)
+        (distance,) = self.ray_distances(origin[None], direction[None])
+        return origin + distance * direction if np.isfinite(distance) else None
+
+    def ray_distances(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Return the distances (n,), in lengths of the directions, of rays (n, 3) to the settled organ; infinity where they miss."""
+        hit, distance, _ = self._tree.intersect_ray_first(self.vertices, self.faces, origins, directions)
+        return np.where(hit >= 0, distance, np.inf)
+
+    @cached_property
+    def _tree(self) -> igl.AABB:
+        tree = igl.AABB()
+        tree.init(self.vertices, self.faces)
+        return tree
 
     def slide(self, lateral_mm: float, elevation_mm: float) -> None:
         """Move the aim over the surface, along the turned transducer's x and y [mm]."""

@@ -1,6 +1,5 @@
 """Whether an instrument through a trocar can hold the probe at a pose."""
 
-import igl
 import numpy as np
 
 from scenes.scene import Trocar
@@ -28,9 +27,8 @@ def reachable(
     along = shafts / np.maximum(length, 1e-9)[:, None]
     can = (length <= trocar.longest_mm) & _within(along @ axis, trocar.cone_deg)
     can &= _within(-np.einsum("ij,ij->i", along, poses[:, :3, 2]), trocar.wrist_deg)
-    for n in np.flatnonzero(can):
-        hits = igl.ray_mesh_intersect(at, along[n], manipulator.vertices, manipulator.faces)
-        can[n] = not hits or hits[0][1] > length[n] - NEAR_MM
+    free = manipulator.ray_distances(np.repeat(at[None], can.sum(), axis=0), along[can])
+    can[can] = free > length[can] - NEAR_MM
     return can
 
 

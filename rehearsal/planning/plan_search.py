@@ -23,7 +23,7 @@ SEED = 20161130
 # Initial step size as a fraction of the ranges: on the rigid surrogate, then in trials, which start at its optimum.
 SURROGATE_SIGMA, TRIAL_SIGMA = 0.2, 0.06
 # Surrogate evaluations of each candidate, which take as long as so many trials; evaluations in a generation.
-SURROGATE_EVALUATIONS, SURROGATE_TRIALS, GENERATION = 240, 5, 8
+SURROGATE_EVALUATIONS, SURROGATE_TRIALS, GENERATION = 240, 2, 8
 # Trials of the search are faster than the planned sweep.
 TRIAL_MM_S = 60.0
 DIGITS = 6

@@ -53,7 +53,7 @@ def path_mm(manipulator: ProbeManipulator, poses: np.ndarray) -> float:
 
 def incidence_deg(manipulator: ProbeManipulator, poses: np.ndarray) -> float:
     """The mean angle between the probe's axis and the normal of the settled surface."""
-    normals = np.stack([manipulator.surface_normal(face) for face in face_centres(manipulator, poses)])
+    normals = manipulator.surface_normals(face_centres(manipulator, poses))
     cosine = np.einsum("ij,ij->i", normals, poses[:, :3, 2])
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).mean())
 
