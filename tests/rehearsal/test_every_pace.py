@@ -112,7 +112,7 @@ class LiveLink(SimpleNamespace):
 PACES = {
     "as set": (lambda: pace_at(0), "", {1}),
     "longer steps": (lambda: pace_at(2), "LONGER STEPS", {2, 3, 4}),
-    "fewer iterations": (lambda: pace_at(-1), "REDUCED ITERATIONS", {2, 3, 4}),
+    # With fewer iterations, too.
     "slow motion": (lambda: pace_at(-1, SlowMachine), "REDUCED ITERATIONS", {2, 3, 4}),
 }
 
