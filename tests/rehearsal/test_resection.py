@@ -11,6 +11,7 @@ from conftest import ROOT
 
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.measurements.live_measurements import LiveMeasurements
+from rehearsal.resection import proposal
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.judgement import findings_of
 from rehearsal.resection.operation import (
@@ -357,7 +358,7 @@ def test_the_view_warns_of_a_line_that_is_too_near_and_shows_the_coming_cut(rehe
 
 
 def test_it_is_cut_but_once_and_page_score_and_plan_are_written_and_compared(
-    patient, rehearsal, marks, tmp_path
+    patient, rehearsal, marks, tmp_path, monkeypatch
 ):
     _, anatomy = patient
     resected(rehearsal, marks)
@@ -366,13 +367,16 @@ def test_it_is_cut_but_once_and_page_score_and_plan_are_written_and_compared(
     moved(live, 2)
     notices = live.notices.present(lambda words: words)
     assert all("cut out already" in notice for notice in notices) and len(notices) == 2
+    lines_of = proposal._lines
+    # Two of all directions: a second for each line.
+    monkeypatch.setattr(proposal, "_lines", lambda *given: lines_of(*given)[:2])
     proposals = propose(
         anatomy.organ, anatomy.tumour, anatomy.parts, MARGIN_MM, anatomy.labels, anatomy.tissues
     )
-    costs = [proposal.cost_ml for proposal in proposals]
+    costs = [each.cost_ml for each in proposals]
     assert costs == sorted(costs) and proposals[0].settings.technique == "enucleoresection"
     assert proposals[0].judgement.margin.margin_mm.min() > MARGIN_MM - 0.1
-    cuts = [planned_cut(proposal, np.zeros(3)) for proposal in proposals]
+    cuts = [planned_cut(each, np.zeros(3)) for each in proposals]
     plan, path = ResectionPlan(anatomy="a", margin_mm=MARGIN_MM, cuts=cuts), tmp_path / "plan.json"
     write_resection_plan(plan, path)
     assert is_resection_plan(path) and read_resection_plan(path) == plan
