@@ -3,6 +3,7 @@
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -369,8 +370,9 @@ def test_it_is_cut_but_once_and_page_score_and_plan_are_written_and_compared(
     notices = live.notices.present(lambda words: words)
     assert all("cut out already" in notice for notice in notices) and len(notices) == 2
     # A line takes half a second: from fewer directions.
-    few = trimesh.Trimesh(trimesh.creation.icosahedron().vertices[::4])
-    monkeypatch.setattr(proposal.trimesh.creation, "icosahedron", lambda: few)
+    few = SimpleNamespace(vertices=trimesh.creation.icosahedron().vertices[::4])
+    creation = SimpleNamespace(icosahedron=lambda: few)
+    monkeypatch.setattr(proposal, "trimesh", SimpleNamespace(creation=creation))
     proposals = propose(
         anatomy.organ, anatomy.tumour, anatomy.parts, MARGIN_MM, anatomy.labels, anatomy.tissues
     )
