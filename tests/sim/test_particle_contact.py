@@ -4,6 +4,7 @@ import igl
 import numpy as np
 import pytest
 import taichi as ti
+import taichi.math as tm
 import trimesh
 from conftest import rotation_about
 from test_solver import on_floor, position, solver_of
@@ -13,20 +14,21 @@ from sim.shapes import FAR, ConvexTool, Plane, SignedDistanceField
 from sim.solver import Solver, StepSettings
 
 
+@ti.kernel
+def ask(
+    shape: ti.template(), points: ti.types.ndarray(ti.f32, ndim=2), answers: ti.types.ndarray(ti.f32, ndim=2)
+):
+    for i in range(points.shape[0]):
+        answer = shape.surface(tm.vec3(points[i, 0], points[i, 1], points[i, 2]))
+        for k in ti.static(range(4)):
+            answers[i, k] = answer[k]
+
+
 def measured(shape, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Normals (n, 3) and signed distances (n,) of a shape."""
-    given = ti.Vector.field(3, ti.f32, len(points))
-    answer = ti.Vector.field(4, ti.f32, len(points))
-    fill((given, points))
-
-    @ti.kernel
-    def ask():
-        for i in given:
-            answer[i] = shape.surface(given[i])
-
-    ask()
-    answers = array_of(answer).astype(np.float64)
-    return answers[:, :3], answers[:, 3]
+    answers = np.zeros((len(points), 4), np.float32)
+    ask(shape, np.ascontiguousarray(points, np.float32), answers)
+    return answers[:, :3].astype(np.float64), answers[:, 3].astype(np.float64)
 
 
 def scattered(count: int = 4000, reach: float = 16.0) -> np.ndarray:
