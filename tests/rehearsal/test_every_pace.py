@@ -83,7 +83,7 @@ def plan_down(rehearsal: Rehearsal, anatomy: LoadedAnatomy) -> Plan:
 
 # What is done in order, each for some time and frames.
 SCRIPT = "rest press rest bookmark sweep press press rest undo redo to_bookmark sweep freeze freeze press press rest"
-PART_S, PART_FRAMES = 0.25, 4
+PART_S, PART_FRAMES = 0.15, 4
 
 
 def everything(rehearsal: Rehearsal, settings: Settings) -> Iterator[Controls]:
