@@ -331,7 +331,8 @@ def test_a_real_kidney_comes_in_and_gives_way(data, tmp_path, monkeypatch, capsy
     assert organ.is_watertight and organ.volume / 1000 == pytest.approx(125.6, rel=0.01)
     assert f"{side} kidney" in said and "crlm" not in (patient / "scene.toml").read_text()
     monkeypatch.setattr("rehearsal.headless.open_viewer", lambda *_, **__: None)
-    assert app.main(["rehearse", str(patient), "--headless", *SHORT, "--out", str(tmp_path / "out")]) == 0
+    few = *SHORT, "--picture", "ct"
+    assert app.main(["rehearse", str(patient), "--headless", *few, "--out", str(tmp_path / "out")]) == 0
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["finite"] and report["max_penetration_mm"] <= 0.8 and report["volume_ratio_min"] > 0.95
     slices = [

@@ -23,6 +23,8 @@ DEPTHS_MM = {
 }
 TILTS_DEG = (5, 10, 20, 40)
 CYST_RADIUS_MM = 2.0
+# Scatterers in and around a cyst, of the reference.
+CYST_POINTS = 30_000
 # Speed of blood, and its angles to the direction of the array.
 BLOOD_CM_S, FLOW_ANGLES_DEG = 20.0, (30, 45, 60, 75)
 SMOOTH = Surface(roughness_mm=0.0, scattered=0.0, scattered_hard=0.0)
@@ -219,7 +221,7 @@ def interfaces(phantom: EchoPhantom, name: str) -> Iterator[Row]:
 
 def cysts(phantom: EchoPhantom, name: str) -> Iterator[Row]:
     """Level in the middle of an anechoic cylinder across the image plane, relative to the tissue around it."""
-    beam, draw, count = _beam(phantom.probe, False), np.random.default_rng(SEED), 30_000
+    beam, draw, count = _beam(phantom.probe, False), np.random.default_rng(SEED), CYST_POINTS
     for depth in DEPTHS_MM[name]:
         phantom.fill(backscatter=0.1 * (np.hypot(phantom.u, phantom.v - depth) > CYST_RADIUS_MM))
         near, middle = np.abs(phantom.depth_mm - depth) < 0.5, phantom.probe.number_of_scanlines // 2

@@ -83,7 +83,7 @@ def plan_down(rehearsal: Rehearsal, anatomy: LoadedAnatomy) -> Plan:
 
 # What is done in order, each for some time and frames.
 SCRIPT = "rest press rest bookmark sweep press press rest undo redo to_bookmark sweep freeze freeze press press rest"
-PART_S, PART_FRAMES = 0.25, 4
+PART_S, PART_FRAMES = 0.15, 4
 
 
 def everything(rehearsal: Rehearsal, settings: Settings) -> Iterator[Controls]:
@@ -112,7 +112,7 @@ class LiveLink(SimpleNamespace):
 PACES = {
     "as set": (lambda: pace_at(0), "", {1}),
     "longer steps": (lambda: pace_at(2), "LONGER STEPS", {2, 3, 4}),
-    "fewer iterations": (lambda: pace_at(-1), "REDUCED ITERATIONS", {2, 3, 4}),
+    # With fewer iterations, too.
     "slow motion": (lambda: pace_at(-1, SlowMachine), "REDUCED ITERATIONS", {2, 3, 4}),
 }
 

@@ -145,7 +145,8 @@ def labelled() -> Grid:
 def test_divided_vessels_are_named_by_the_labels_and_ordered_by_their_width():
     parts, tumour = dict(vessel=vessels()), ball(5.0, (0.0, 0.0, 18.0))
     cut = cut_by(ORGAN, half_space(6.0))
-    found = judged(cut, tumour, parts, labels=labelled(), tissues={1: "vein", 2: "artery"}).vessels
+    named = judged(cut, tumour, parts, labels=labelled(), tissues={1: "vein", 2: "artery"})
+    found = named.vessels
     assert [vessel.tissue for vessel in found] == ["vein", "artery"]
     # Faces at the border count wholly or not: a random half of an edge.
     assert [vessel.diameter_mm for vessel in found] == pytest.approx([4.0, 3.0], abs=FACE_MM / 2)
@@ -153,8 +154,7 @@ def test_divided_vessels_are_named_by_the_labels_and_ordered_by_their_width():
     # Labels that name neither arteries nor veins there.
     other = judged(cut, tumour, parts, labels=labelled(), tissues={1: "cortex", 2: "medulla"}).vessels
     assert {each.tissue for each in other} == {"vessel"}
-    report = judged(cut, tumour, parts, labels=labelled(), tissues={1: "vein", 2: "artery"}).report()
-    assert [vessel["tissue"] for vessel in report["vessels"]] == ["vein", "artery"]
+    assert [vessel["tissue"] for vessel in named.report()["vessels"]] == ["vein", "artery"]
 
 
 def test_a_vessel_that_the_cut_only_grazes_is_none():

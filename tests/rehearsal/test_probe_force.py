@@ -1,6 +1,7 @@
 """The tissue's force on the probe: in each step, for a haptic device, and in the session's file."""
 
 import json
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -15,9 +16,16 @@ from scenes.scene import with_options
 from ultrasound.probe_manipulator import array_face_centre
 
 
-@pytest.fixture
-def rehearsal(device) -> Rehearsal:
+@pytest.fixture(scope="module")
+def built(one_device) -> Rehearsal:
     return Rehearsal(with_options(briefly(60), {"tissue.cell_mm": 4.0}), small_anatomy())
+
+
+@pytest.fixture
+def rehearsal(built) -> Iterator[Rehearsal]:
+    built.reset()
+    yield built
+    built.on_wrench = None
 
 
 def pressed(rehearsal: Rehearsal, depth_mm: float, steps: int = 40) -> list:
@@ -52,7 +60,7 @@ def test_a_haptic_device_is_called_after_each_step(rehearsal):
         assert pose is step.pose and wrench is step.wrench
 
 
-def test_a_model_whose_contacts_have_no_forces_has_no_wrench(device):
+def test_a_model_whose_contacts_have_no_forces_has_no_wrench(one_device):
     scene = with_options(briefly(5), {"tissue.radius_mm": 3.3})
     organ = PressedOrgan(scene, small_anatomy())
     organ.on_wrench = lambda *_: pytest.fail("called without a force")

@@ -1,11 +1,13 @@
 """A whole scene: at rest its slice is the CT, pressed it gives way, and twice it gives the same bits."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import SimpleITK as sitk
 import trimesh
+from coarse_patient import thinned
 from slicing import hounsfield, organ_mask
 
 from rehearsal.frame import image_view
@@ -53,7 +55,8 @@ def real_patient(data: Path, tmp_path: Path) -> tuple[Scene, Path]:
 
 def pressed_phantom() -> Rehearsal:
     scene, folder = phantom()
-    return Rehearsal(scene, load_anatomy(scene, folder))
+    whole = load_anatomy(scene, folder)
+    return Rehearsal(scene, replace(whole, ct=thinned(whole.ct), labels=thinned(whole.labels)))
 
 
 def resampled(folder: Path, plane, origin: np.ndarray, pixels: int) -> np.ndarray:

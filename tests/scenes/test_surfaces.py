@@ -36,7 +36,7 @@ def coarse(monkeypatch):
 class TestSurface:
     @pytest.mark.parametrize(
         ("direction", "spacing"),
-        [*((direction, "thick") for direction in DIRECTIONS), ("oblique", "even")],
+        [("left-handed", "thick"), ("slices first", "thick"), ("oblique", "thick"), ("oblique", "even")],
     )
     def test_lies_where_the_label_is(self, direction, spacing):
         (centre, axes), direction, spacing = LEFT, DIRECTIONS[direction], SPACINGS[spacing]

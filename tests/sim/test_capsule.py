@@ -82,8 +82,8 @@ def numeric_force(capsule: Capsule, x: np.ndarray, nodes, step: float) -> np.nda
 
 # Taut, slack in one direction, and slack in places.
 @pytest.mark.parametrize("stretch", [(1.2, 1.15, 1.25), (1.3, 0.7, 1.1), (0.9, 0.95, 1.05)])
-def test_force_is_the_energys_derivative_and_the_stiffness_bounds_its_own(one_device, ball, stretch):
-    model = with_capsule(ball, 4.0)
+def test_force_is_the_energys_derivative_and_the_stiffness_bounds_its_own(kept, ball, stretch):
+    model = kept(with_capsule, ball, 4.0)
     x = deformed(model.lattice.nodes, 0.05) * stretch
     x = x.astype(np.float32).astype(float)
     force, stiffness = forces_of(model, x)
@@ -116,9 +116,9 @@ def test_force_is_the_energys_derivative_and_the_stiffness_bounds_its_own(one_de
 
 
 @pytest.mark.parametrize("stretch", [1.05, 1.5])
-def test_an_inflated_sphere_has_the_membranes_pressure(one_device, ball, stretch):
+def test_an_inflated_sphere_has_the_membranes_pressure(kept, ball, stretch):
     """p = 2 (mu h / R) (1 / stretch - 1 / stretch^7); its virtual power is that of the nodes' forces."""
-    model = with_capsule(ball, 3.0)
+    model = kept(with_capsule, ball, 3.0)
     x = stretch * model.lattice.nodes
     force, _ = forces_of(model, x)
     pressure = 2 * STIFFNESS / 3 * N_MM / 12.0 * (1 / stretch - stretch**-7.0)

@@ -66,6 +66,13 @@ def solver_of(model: str, mesh: trimesh.Trimesh, *shapes: Callable) -> Solver:
     return Solver(particle_tissue(mesh, shapes=made), tool=moving)
 
 
+def on_floor(kept, model: str, mesh: trimesh.Trimesh) -> Solver:
+    """A body on a floor, with nothing else near it."""
+    solver = kept(solver_of, model, mesh, floor, tool)
+    away(solver)
+    return solver
+
+
 def settings(model: str) -> StepSettings:
     return settings_of(8, DOWN) if model == "neo-hookean" else StepSettings(gravity=DOWN)
 
@@ -114,8 +121,7 @@ def test_pressed_tissue_passes_the_check_and_a_diverged_state_is_restored(kept, 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_a_tangled_state_is_restored_after_a_delay(kept, ball, model):
-    solver = kept(solver_of, model, ball, floor, tool)
-    away(solver)
+    solver = on_floor(kept, model, ball)
     divergence_check = DivergenceCheck(solver)
     mirrored = solver.body.rest_points * [1, 1, -1]
     flat = solver.body.rest_points * [1, 1, 1e-3]
@@ -130,7 +136,7 @@ def test_a_tangled_state_is_restored_after_a_delay(kept, ball, model):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_tissue_is_torn_at_a_multiple_of_an_edges_rest_length(kept, ball, model):
-    solver = kept(solver_of, model, ball, floor)
+    solver = on_floor(kept, model, ball)
     divergence_check = DivergenceCheck(solver)
     for share, tangled in ((0.99, 0.0), (1.01, 1.0)):
         put(solver, share * TORN * solver.body.rest_points)
@@ -138,7 +144,7 @@ def test_tissue_is_torn_at_a_multiple_of_an_edges_rest_length(kept, ball, model)
 
 
 def test_the_delay_starts_again_after_a_tangle_is_resolved(kept, ball):
-    solver = kept(solver_of, "neo-hookean", ball, floor)
+    solver = on_floor(kept, "neo-hookean", ball)
     divergence_check = DivergenceCheck(solver)
     rest = solver.body.rest_points
     # Resolved too early for a good state to be stored, which would restart the delay as well.
@@ -171,7 +177,7 @@ def test_tissue_near_the_tool_is_not_counted_as_tangled(kept, ball):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_torn_points_stay_finite(kept, ball, model):
-    solver = kept(solver_of, model, ball, floor)
+    solver = on_floor(kept, model, ball)
     for mm in (100.0, 1000.0):
         put(solver, solver.body.rest_points + np.random.default_rng(0).normal(0, mm, (solver.body.count, 3)))
         for _ in range(5):
@@ -183,13 +189,12 @@ def test_torn_points_stay_finite(kept, ball, model):
 @pytest.mark.parametrize("velocity", [(0, 0, -1e4), (1e3, 0, -1e6)])
 def test_fast_bodies_do_not_pass_through_a_floor(kept, ball, model, velocity):
     # For a block 30 mm thick and for a half-space, from 100 mm above.
-    for shape in (floor, thick):
-        solver = kept(solver_of, model, ball, shape)
+    for solver in (on_floor(kept, model, ball), kept(solver_of, model, ball, thick)):
         put(solver, solver.body.rest_points + [0, 0, 100.0], velocity)
         for _ in range(20):
             solver.step(settings(model))
         # The impact is found within 1 mm, and a step of contact leaves some penetration.
-        assert position(solver)[:, 2].min() > -12.0 - 6.0, shape
+        assert position(solver)[:, 2].min() > -12.0 - 6.0
 
 
 @ti.kernel
@@ -296,7 +301,7 @@ def test_a_body_on_few_contact_points_is_at_rest(one_device):
     ],
 )
 def test_settings_out_of_range_are_named(kept, ball, changed, named):
-    solver = kept(solver_of, "shape-matching", ball, floor)
+    solver = on_floor(kept, "shape-matching", ball)
     before = position(solver)
     with pytest.raises(ValueError, match=f"(?s){named}"):
         solver.step(StepSettings(**changed))

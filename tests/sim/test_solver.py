@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from particle_tissue import tissue_of
 
+from sim.body import ParticleBody
 from sim.fields import array_of, fill
+from sim.sampling import fill_body
 from sim.self_contact import SelfContacts
 from sim.shapes import ConvexTool, Plane, SignedDistanceField
 from sim.solver import Solver, StepSettings
@@ -217,5 +219,5 @@ def test_over_relaxation_converges_faster(kept, ball):
 def test_features_switched_off_take_no_memory(kept, block):
     solver = kept(solver_of, block)
     assert not hasattr(solver.body, "mass_scale") and solver.contacts is None and solver.self_contacts is None
-    assert hasattr(solver_of(block, scaling=0.1).body, "mass_scale")
+    assert hasattr(ParticleBody(fill_body(block, 2.0), 0.1), "mass_scale")
     assert not hasattr(kept(on_floor, block, -8.0, 0.0).contacts, "push")

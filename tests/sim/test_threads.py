@@ -1,15 +1,13 @@
 """The same bits after another start of Taichi, with any number of threads."""
 
 import hashlib
-from dataclasses import replace
 
 import numpy as np
 import taichi as ti
-from test_rehearsal import LOOK, phantom
+from coarse_patient import coarse_patient
+from test_rehearsal import LOOK
 from test_solver import position, solver_of
 
-from rehearsal.rehearsal import Rehearsal
-from scenes.anatomy import Grid, load_anatomy
 from sim.device import start
 from sim.fields import array_of
 from sim.shapes import ConvexTool, Plane
@@ -33,21 +31,11 @@ def test_self_contact_gives_the_same_bits_for_any_number_of_threads(ball):
     ti.reset()
 
 
-def thinned(grid: Grid) -> Grid:
-    """Every other voxel each way."""
-    half = np.diag([0.5, 0.5, 0.5, 1.0])
-    return Grid(np.ascontiguousarray(grid.voxels[::2, ::2, ::2]), half @ grid.index_from_mm)
-
-
 def test_two_runs_of_a_scene_give_the_same_bits():
-    scene, folder = phantom()
-    scene = scene.model_copy(update={"press": scene.press.model_copy(update={"warm_up_steps": 20})})
-    whole = load_anatomy(scene, folder)
-    anatomy = replace(whole, ct=thinned(whole.ct), labels=thinned(whole.labels))
     digests = []
     for _ in range(2):
         start("cpu")
-        rehearsal = Rehearsal(scene, anatomy)
+        rehearsal = coarse_patient()[0]
         for step in range(20):
             rehearsal.advance(rehearsal.scripted_pose(step / 20 * rehearsal.script_length_s()))
         state = rehearsal.body.snapshot()

@@ -50,9 +50,9 @@ COARSE = setup_of("shape-matching", radius_mm=3.0)
 BRIEF = setup_of("shape-matching", radius_mm=3.0, warm_up_steps=12, stage_steps=9)
 
 
-@pytest.fixture
-def case(tmp_path) -> BeadCase:
-    return load_case(write_case(tmp_path / "ball"))
+@pytest.fixture(scope="module")
+def case(tmp_path_factory) -> BeadCase:
+    return load_case(write_case(tmp_path_factory.mktemp("ball") / "ball"))
 
 
 def test_figures_of_a_stage_by_hand():
@@ -97,8 +97,13 @@ def test_distance_from_the_probe_is_that_of_the_rounded_cuboid_at_its_pose(case)
     assert probe_distances(placed)[0] == pytest.approx([2, 3, -4, 3**0.5 - 1])
 
 
-def test_report_and_table_show_these_figures(device, case):
-    experiment = BeadExperiment(case, COARSE)
+@pytest.fixture(scope="module")
+def experiment(one_device, case) -> BeadExperiment:
+    """Each run begins at rest."""
+    return BeadExperiment(case, COARSE)
+
+
+def test_report_and_table_show_these_figures(experiment, case):
     off = np.linspace(0, 1, 12)[:, None] * np.array([0.0, 0.0, 1.0])
     unknown = np.full((3, 3), np.nan)
     run = BeadRun(case.measured + off, step_ms=[1.0, 2.0, 6.0], force_n=unknown, parts_mm=np.zeros((3, 0, 3)))
@@ -125,7 +130,7 @@ def test_report_and_table_show_these_figures(device, case):
     assert "NOT FINITE" in summary(figures, experiment.describe(COARSE)) and "nan" in table(case, lost.beads)
 
 
-def test_the_probe_waits_above_then_goes_to_each_stage_and_rests_there_wherever_the_case_is(device, case):
+def test_the_probe_waits_above_then_goes_to_each_stage_and_rests_there_wherever_the_case_is(one_device, case):
     far = np.array([100.0, -200.0, 1000.0])
     organ, support = (mesh.copy().apply_translation(far) for mesh in (case.organ, case.support))
     poses = case.poses + np.pad(far[:, None], ((0, 1), (3, 0)))
@@ -147,8 +152,7 @@ def test_the_probe_waits_above_then_goes_to_each_stage_and_rests_there_wherever_
         assert lowest[120 + stage * 90 + 59 : 120 + (stage + 1) * 90] == pytest.approx(12.0 - depth)
 
 
-def test_a_pressed_ball_sinks_the_same_every_time_whatever_ran_between(device, case):
-    experiment = BeadExperiment(case, COARSE)
+def test_a_pressed_ball_sinks_the_same_every_time_whatever_ran_between(experiment, case):
     first = experiment.run(BRIEF)
     other = experiment.run(BRIEF.but(stiffness=0.4, iterations=5))
     again = experiment.run(BRIEF)
@@ -216,7 +220,7 @@ def test_validate_reports_mistakes_in_one_line(tmp_path, capsys):
     assert "stage" in refused(folder)
 
 
-def test_a_real_case_is_pressed(device, data):
+def test_a_real_case_is_pressed(one_device, data):
     case = load_case(data / "truth" / "bean")
     assert case.measured.shape == (4, 45, 3) and case.young_kpa == 15.0
     # The README of the truth names these displacements.

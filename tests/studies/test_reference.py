@@ -201,7 +201,7 @@ def pressed_ball(indentations_mm: tuple[float, ...]) -> tuple[FemExperiment, lis
     block = trimesh.creation.box([40.0, 40.0, 8.0])
     block.apply_translation([0.0, 0.0, -12.7])
     press = FemPress(size_mm=(12.0, 6.0, 8.0), indentations_mm=indentations_mm)
-    mesh = tetrahedra(ball, lambda points: np.full(len(points), 9.0))
+    mesh = tetrahedra(ball, lambda points: np.full(len(points), 12.0))
     return FemExperiment(mesh, block, TISSUE, press), [ball, block]
 
 

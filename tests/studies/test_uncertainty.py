@@ -73,7 +73,8 @@ def test_what_is_declared_or_has_a_surface_is_varied_over_the_tables_range():
 
 
 def test_values_reach_the_solver(device, problem):
-    rehearsal = Rehearsal(problem.scene, problem.anatomy)
+    at_once = problem.scene.press.model_copy(update=dict(warm_up_steps=0))
+    rehearsal = Rehearsal(problem.scene.model_copy(update=dict(press=at_once)), problem.anatomy)
     model = rehearsal.model
     tether, weight = array_of(model.tether), array_of(model.capsule.weight)
     values = {
@@ -184,7 +185,7 @@ def test_a_band_is_around_the_value_and_grows_with_the_depth():
 
 
 def test_the_panel_shows_the_band_beside_the_measurement(device):
-    rehearsal = Rehearsal(with_options(briefly(2), {"tissue.cell_mm": 4.0}), small_anatomy())
+    rehearsal = Rehearsal(with_options(briefly(0), {"tissue.cell_mm": 4.0}), small_anatomy())
     rehearsal.pose = rehearsal.pose_at_depth(2.0)
     measurements = LiveMeasurements(rehearsal, bands=bands())
     measurements.latest = Measurement(1.0, 20.0, force_n=0.5)

@@ -109,7 +109,9 @@ def sliced(kept, mesh, image: Callable, move=None, pixels: int = 96, outside: st
     body = kept(embedded, mesh)
     if move is not None:
         body.move(move(body.model.body.rest_points))
-    cut = kept(cut_of, body.embedding, mesh, image, pixels, outside)
+    # Only the voxels differ from image to image.
+    cut = kept(cut_of, body.embedding, mesh, ramp_image, pixels, outside)
+    cut.ct.set_values((slice(None),) * 3, anatomy_of(mesh, image()).hu)
     plane = oblique_plane()
     cut.plane.locate(plane)
     cut.ct_slice(350.0, 40.0)

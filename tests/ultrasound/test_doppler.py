@@ -6,7 +6,7 @@ import taichi as ti
 import trimesh
 from conftest import rotation_about
 from particle_tissue import tissue_of
-from test_bmode import BOUNDLESS, TISSUE, Tank, flat_tank, probe_of
+from test_bmode import TISSUE, Tank, flat_tank, probe_of
 
 from sim.body import BodyState
 from sim.device import start
@@ -230,7 +230,7 @@ def test_the_error_of_an_estimate_is_that_of_ten_pulses(vessel):
 
 
 def test_an_anatomy_has_flow_only_within_its_volume(vessel):
-    tank = Tank((BOUNDLESS,) * 3, (1, 1, 1), (0.0, 0.0, 0.0))
+    tank = vessel.tank
     tank.fill(TISSUE, 0.0, 0.01)
     nowhere = SampledVolume(np.ones((1, 1, 1, 5)), np.array([[1, 0, 0, 500.0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), outside=0.0)  # fmt: skip
     doppler, probe = Doppler(tank.bmode.sound, tank.bmode, nowhere), probe_of(**SETTINGS, **QUIET)
