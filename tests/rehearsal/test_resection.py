@@ -329,6 +329,17 @@ def test_many_cuts_and_undos_leave_no_fields_and_a_cut_survives_as_text(rehearsa
     assert trees[2] <= trees[0] + 1
 
 
+def test_the_distance_of_a_line_to_the_tumour_is_negative_over_it():
+    """Along the line's outward direction, here z: a point over the middle of a cube of 10 mm, one over its edge, and two beside it."""
+    line = SimpleNamespace(
+        frame=lambda: np.eye(3), points=np.array([[0.0, 0, 9], [5, 0, 9], [8, 0, 9], [8, 9, 9]])
+    )
+    tumour = trimesh.creation.box([10.0, 10.0, 10.0])
+    found = distance_to_tumour(SimpleNamespace(score=line, whole_tumour=tumour))
+    assert found == pytest.approx([-5.0, 0.0, 3.0, 5.0], abs=1e-12)
+    assert len(distance_to_tumour(SimpleNamespace(score=line, whole_tumour=None))) == 0
+
+
 def test_the_view_warns_of_a_line_that_is_too_near_and_shows_the_coming_cut(rehearsal, marks):
     shown = ResectionView(rehearsal)
     seen = LiveMeasurements(rehearsal).coverage

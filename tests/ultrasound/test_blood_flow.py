@@ -124,4 +124,7 @@ def test_the_pulse_rises_to_systole_and_falls_until_the_next_beat():
         SYSTOLE_S, abs=0.01
     )
     assert share[0] == 0 and share[-1] < 0.02 and (np.diff(share[time > SYSTOLE_S]) < 0).all()
+    assert pulse_share(SYSTOLE_S) == pytest.approx(1) and pulse_share(BEAT_S - 1e-9) == pytest.approx(
+        0, abs=1e-7
+    )
     assert pulse_share(0.3) == pytest.approx(pulse_share(0.3 + 2 * BEAT_S))
