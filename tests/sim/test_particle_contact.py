@@ -77,15 +77,20 @@ def test_the_nearest_point_outside_a_rounded_cuboid_is_just_outside_its_face(one
     out = ti.Vector.field(3, ti.f32, 6)
 
     @ti.kernel
-    def ask():
+    def ask(x: float, y: float, z: float):
         for k in range(6):
-            out[k] = tool.outside(ti.Vector([1.0, 0.5, -0.5]), k)
+            out[k] = tool.outside(ti.Vector([x, y, z]), k)
 
-    ask()
-    for point, k in zip(array_of(out), range(6), strict=True):
-        expected = np.array([1.0, 0.5, -0.5])
-        expected[k % 3] = (1 if k < 3 else -1) * ([6.0, 3.0, 4.0][k % 3] + 1e-3)
-        assert point == pytest.approx(expected, abs=1e-6)
+    away = np.eye(4)
+    away[:3, :3], away[:3, 3] = rotation_about([1, 2, 3], 70), [20.0, -10.0, 5.0]
+    for pose in (np.eye(4), away):
+        tool.move(pose, pose)
+        ask(*(pose @ [1.0, 0.5, -0.5, 1.0])[:3])
+        for point, k in zip(array_of(out), range(6), strict=True):
+            expected = np.array([1.0, 0.5, -0.5, 1.0])
+            expected[k % 3] = (1 if k < 3 else -1) * ([6.0, 3.0, 4.0][k % 3] + 1e-3)
+            # Places of up to 25 mm, in float32.
+            assert point == pytest.approx((pose @ expected)[:3], abs=1e-5)
 
 
 @pytest.mark.parametrize("edge_radius", [-0.1, 3.1])

@@ -178,6 +178,19 @@ def test_blood_of_a_clamped_kidney_rests_and_pulses_otherwise(vessel):
     assert array_of(vessel.straight.moment)[40:150, 8:60, 2].max() < 2 * STOPPED * 0.01**2
 
 
+def test_tissue_is_left_behind_the_wall_filter_as_bright_as_it_is_where_it_is(vessel):
+    vessel.tank.fill(backscatter=lambda x, y, z: 0.01 + 1e-4 * y + 5e-5 * x)
+    vessel.set_flow([0.0, 0.0, 0.0], amplitude=0.0)
+    probe, sound = probe_of(**SETTINGS), vessel.tank.bmode.sound
+    vessel.look(probe)
+    level = array_of(sound.amplitude).astype(float) * array_of(sound.tissue)[..., 2]
+    found = array_of(vessel.straight.moment)[5:150, 8:60, 2]
+    assert (
+        found == pytest.approx(level[5:150, 8:60] ** 2 * STOPPED, rel=1e-4, abs=0)
+        and np.ptp(found) > found.min()
+    )
+
+
 def test_the_sample_volume_averages_and_keeps_the_energy(vessel):
     """Blood is where y > 20, moving towards the array."""
     vessel.tank.fill()
