@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import taichi as ti
-from taichi.lang import impl, kernel_impl
+from taichi.lang import impl
 
 from sim.device import on_cpu
 
@@ -198,13 +198,6 @@ def _materialize_and_fill(runtime: impl.PyTaichi) -> None:
             _memory(field)[...] = values
 
 
-def _fill_and_launch(kernel: kernel_impl.Kernel, *arguments: object) -> object:
-    if _WAITING.get(impl.get_runtime()):
-        impl.get_runtime().materialize()
-    return _launch(kernel, *arguments)
-
-
-# Taichi calls the first before it builds a kernel or reads an element, and the second to run one: what uses a new field does so after.
-_materialize, _launch = impl.PyTaichi.materialize, kernel_impl.Kernel.launch_kernel
+# Taichi calls this before it runs a kernel or reads an element.
+_materialize = impl.PyTaichi.materialize
 impl.PyTaichi.materialize = _materialize_and_fill
-kernel_impl.Kernel.launch_kernel = _fill_and_launch

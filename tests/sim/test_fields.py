@@ -5,6 +5,7 @@ import pytest
 import taichi as ti
 from taichi.lang import impl
 
+from sim import fields
 from sim.fields import FieldSet, array_of, empty_fields, field_of, fields_of, fill
 
 
@@ -31,9 +32,9 @@ def test_arrays_written_together_are_unchanged(one_device):
         random.normal(size=(4, 5, 3)),
         random.normal(size=(6, 2, 4)),
     )
-    fields = ti.field(ti.i32, 7), ti.Vector.field(3, ti.f32, (4, 5)), ti.Matrix.field(2, 4, ti.f32, 6)
-    fill(*zip(fields, (counts, places, turns), strict=True))
-    for field, values in zip(fields, (counts, places, turns), strict=True):
+    made = ti.field(ti.i32, 7), ti.Vector.field(3, ti.f32, (4, 5)), ti.Matrix.field(2, 4, ti.f32, 6)
+    fill(*zip(made, (counts, places, turns), strict=True))
+    for field, values in zip(made, (counts, places, turns), strict=True):
         assert np.array_equal(field.to_numpy(), values.astype(field.to_numpy().dtype))
     whole, broken = fields_of(counts, 0.5 * counts)
     assert np.array_equal(whole.to_numpy(), counts) and np.array_equal(broken.to_numpy(), 0.5 * counts)
@@ -53,6 +54,25 @@ def test_values_read_from_memory_are_those_that_taichi_reads(one_device, shape):
         assert np.array_equal(array_of(field), values) and array_of(field).shape == whole
         fill((field, 2 * values))
         assert np.array_equal(field.to_numpy(), 2 * values)
+
+
+def test_a_new_field_has_its_values_once_any_kernel_runs(one_device):
+    """Also one that was built before and does not use the field: GGUI reads memory itself after such a kernel."""
+    old = field_of(np.ones(3))
+
+    @ti.kernel
+    def double():
+        for i in old:
+            old[i] = 2 * old[i]
+
+    double()
+    new, values = field_of(np.zeros(4)), np.arange(4.0)
+    fill((new, values), (new, 2 * values))
+    values[:] = -1.0
+    double()
+    # Where a view is, the values were written: later ones go straight there.
+    assert new in fields._VIEWS and np.array_equal(fields._VIEWS[new], [0, 2, 4, 6])
+    assert np.array_equal(array_of(old), [4, 4, 4])
 
 
 def test_an_array_read_is_a_copy(one_device):
