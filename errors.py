@@ -1,6 +1,7 @@
 """Errors that the user can correct, and their messages; used by all folders."""
 
 import difflib
+import reprlib
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
@@ -8,6 +9,10 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
+
+# How what was found is written: as Python has it, but never a whole matrix or file.
+FOUND = reprlib.Repr()
+FOUND.maxlist, FOUND.maxstring = 4, 80
 
 
 class UserError(ValueError):
@@ -56,10 +61,12 @@ def explained(
         text = f"{name}: {unknown(where)}"
     elif first["type"] == "missing":
         text = f"{name}: missing"
+    elif first["type"] == "json_invalid":
+        text = "invalid JSON"
     elif isinstance(first["input"], dict):
         text = message if message.startswith(name) else f"{name}: {message}"
     else:
-        text = f"{name} = {first['input']!r}: {message}"
+        text = f"{name} = {FOUND.repr(first['input'])}: {message}"
     more = len(problems) - 1
     return text + (f" (and {more} more)" if more else "")
 

@@ -16,6 +16,7 @@ from pydantic import AliasChoices, Field, ValidationError, model_validator
 from errors import UserError, explained, meant
 from scenes.section import Direction, Length, Section, Vector3
 from scenes.tissue import TISSUES, NeoHookeanTissue, Tissue
+from version import FORMAT, of_this_format
 
 # The scene of the embedded patient.
 EMBEDDED = Path(__file__).parent / "phantom.toml"
@@ -212,8 +213,9 @@ class Press(Section):
 
 
 class Scene(Section):
-    """A scene. ``shape`` lists the rigid shapes: the support first. ``uncertainty`` is a file of ``study uncertainty``."""
+    """A scene. ``nephron_scene`` is the format; scenes without it are read as those of this version. ``shape`` lists the rigid shapes: the support first. ``uncertainty`` is a file of ``study uncertainty``."""
 
+    nephron_scene: int = FORMAT
     title: str = ""
     uncertainty: str | None = None
     anatomy: AnatomyFiles
@@ -227,6 +229,11 @@ class Scene(Section):
     trocar: Trocar = Trocar()
     image: Image = Image()
     press: Press = Press()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_this_format(cls, values: Any) -> Any:
+        return of_this_format(values, "nephron_scene")
 
     @model_validator(mode="after")
     def _has_its_parts(self) -> "Scene":

@@ -301,5 +301,7 @@ def test_data_formats_list_every_key(heading, models):
         keys |= {"title"}
         for name, field in Scene.model_fields.items():
             keys |= set(getattr(field.annotation, "model_fields", {}))
-            assert name in ("title", "shape", "uncertainty") or f"[{name}]" in section(heading)
+            assert name in ("nephron_scene", "title", "shape", "uncertainty") or f"[{name}]" in section(
+                heading
+            )
     assert keys <= section(heading), keys - section(heading)

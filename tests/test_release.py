@@ -14,7 +14,8 @@ from packaging.utils import canonicalize_name
 from test_session import header
 
 from rehearsal.run import replay_warning
-from version import PROJECT, VERSION
+from scenes.scene import AnatomyFiles, Scene, scene_text
+from version import FORMAT, PROJECT, VERSION
 
 # Licences that a program under Apache-2.0 can use, as packages name them.
 COMPATIBLE_LICENCES = {
@@ -65,6 +66,12 @@ def test_the_version_is_the_same_everywhere(tmp_path):
         [sys.executable, str(ROOT / "app.py"), "--version"], cwd=tmp_path, capture_output=True, text=True
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, f"nephron, version {VERSION}\n", "")
+
+
+def test_files_have_the_format_of_the_major_version():
+    written = scene_text(Scene(anatomy=AnatomyFiles(phantom=True))), header().model_dump_json()
+    assert f"{FORMAT}." == VERSION[:2] and f"nephron_scene = {FORMAT}\n" in written[0]
+    assert f'"nephron_session":{FORMAT},' in written[1]
 
 
 def test_citation_and_changelog_have_this_version():

@@ -259,7 +259,7 @@ class ImageOptions(CommandOptions):
     """Probe, by its name or as a file [the scene's]."""
     picture: Mode | None = None
     """B-mode, CT or both [the scene's]."""
-    detail_level: Annotated[DetailLevel | None, "--detail-level", "--rung"] = None
+    detail_level: Annotated[DetailLevel | None, "--detail-level"] = None
     """Detail level (realism) of the B-mode image [the scene's]."""
 
 

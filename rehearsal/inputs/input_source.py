@@ -25,8 +25,6 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "plan_for": TARGETS,
     "technique": TECHNIQUES,
 }
-# What sessions of version 1.0 call a setting -> its name now.
-RENAMED = {"rung": "detail_level"}
 
 
 # A replay that is further behind than this goes on from there.
@@ -158,8 +156,7 @@ class ReplayInput:
 def set_settings(settings: Settings, values: dict[str, Any]) -> None:
     """Set what a session recorded. Raises SessionError for an unknown setting or a value out of its range."""
     known = {each.name: each.metadata for each in fields(settings)}
-    for recorded, value in values.items():
-        name = RENAMED.get(recorded, recorded)
+    for name, value in values.items():
         if name not in known or not _fits(getattr(settings, name), value, name, known[name]):
             raise SessionError(
                 f"the session sets {name} to {value!r}, which it cannot be: its file is damaged"

@@ -3,18 +3,27 @@
 import json
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    JsonValue,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 from scipy.spatial.transform import Rotation
 
-from errors import UserError
+from errors import UserError, explained
 from rehearsal.result_files import next_number
 from rehearsal.tracking.pose_file import Pose, TimedPoses
 from scenes.atomic_files import atomic_write
 from scenes.scene import Trocar
 from ultrasound.target import Target
+from version import FORMAT, of_this_format
 
 MOST_POSES, MOST_MARGIN_MM = 20_000, 30.0
 # The most kinds of sweep that are compared.
@@ -74,7 +83,7 @@ class PlannedSweep(_FileModel):
 class Plan(_FileModel):
     """``version`` is the Nephron that made it, ``anatomy`` the fingerprint of the patient's files, ``why`` the reasons for the order."""
 
-    nephron_plan: Literal[1] = 1
+    nephron_plan: int = FORMAT
     version: str | None = None
     anatomy: str
     target: Target
@@ -86,6 +95,11 @@ class Plan(_FileModel):
     seed: int
     why: list[str]
     sweeps: list[PlannedSweep] = Field(min_length=1)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_this_format(cls, values: Any) -> Any:
+        return of_this_format(values, "nephron_plan")
 
 
 def write_plan(plan: Plan, path: Path) -> None:
@@ -116,12 +130,8 @@ def read_plan(path: Path) -> Plan:
     except OSError as error:
         raise PlanError(f"{path}: cannot be read as a plan ({error.strerror})") from None
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        if first["type"] == "json_invalid":
-            raise PlanError(f"{path}: not a plan; expected a file that app.py plan wrote") from None
-        where = ".".join(map(str, first["loc"]))
         raise PlanError(
-            f"{path}: not a plan{f', {where}' if where else ''}: {first['msg'].lower()}; expected a file that app.py plan wrote"
+            f"{path}: not a plan of this version ({explained(error)}); expected a file that app.py plan wrote"
         ) from None
 
 

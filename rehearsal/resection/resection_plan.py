@@ -2,17 +2,26 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    JsonValue,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
-from errors import UserError
+from errors import UserError, explained
 from rehearsal.resection.judgement import Judgement
 from rehearsal.resection.proposal import Proposal, cost_ml
 from rehearsal.resection.script import Number
 from render.viewer import Technique
 from scenes.atomic_files import atomic_write
+from version import FORMAT, of_this_format
 
 # The first bytes of a plan contain this.
 MARK = b'"nephron_resection"'
@@ -51,11 +60,16 @@ class PlannedCut(_FileModel):
 class ResectionPlan(_FileModel):
     """``version`` is the Nephron that made it, ``anatomy`` the fingerprint of the patient's files."""
 
-    nephron_resection: Literal[1] = 1
+    nephron_resection: int = FORMAT
     version: str | None = None
     anatomy: str
     margin_mm: float = Field(ge=0, le=30)
     cuts: list[PlannedCut] = Field(min_length=1)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_this_format(cls, values: Any) -> Any:
+        return of_this_format(values, "nephron_resection")
 
     @property
     def best(self) -> PlannedCut:
@@ -113,9 +127,6 @@ def read_resection_plan(path: Path) -> ResectionPlan:
             f"{path}: cannot be read as a plan of a resection ({error.strerror})"
         ) from None
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(map(str, first["loc"]))
         raise ResectionPlanError(
-            f"{path}: not a plan of a resection{f', {where}' if where else ''}: {first['msg'].lower()}; expected a file that app.py plan "
-            "--resect wrote"
+            f"{path}: not a plan of a resection of this version ({explained(error)}); expected a file that app.py plan --resect wrote"
         ) from None

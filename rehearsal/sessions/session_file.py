@@ -13,14 +13,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from typing_extensions import TypedDict
 
-from errors import UserError
+from errors import UserError, explained
 from rehearsal.resection.resection_state import MOST_MARKS
 from rehearsal.sessions.packed_arrays import Seen, SeenVoxels, unpack_lengths, unpack_poses
 from render.viewer import Technique
 from scenes.scene import Scene
 from ultrasound.crater import Filling
+from version import FORMAT, of_this_format
 
-FORMAT = 1
 MOST_FILE_BYTES = 2_000_000_000
 # The parts of a scene that belong to the patient's folder and may name files.
 PATIENTS: dict[str, Any] = {
@@ -40,7 +40,7 @@ class _Line(BaseModel):
 class Header(_Line):
     """What is rehearsed, by which version of Nephron. ``anatomy`` is the fingerprint of the scene's files."""
 
-    nephron_session: Literal[1] = 1
+    nephron_session: int = FORMAT
     version: str | None = Field(None, pattern=r"^[0-9A-Za-z.+-]{1,40}$")
     anatomy: str
     scene: dict[str, Any]
@@ -49,6 +49,11 @@ class Header(_Line):
     time_step_s: float = Field(gt=0)
     begins: str | None = None
     """The state that it begins with, where that is not the settled one."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_this_format(cls, values: Any) -> Any:
+        return of_this_format(values, "nephron_session")
 
 
 class SolverValues(TypedDict, total=False):
@@ -209,16 +214,11 @@ def _lengths_of(second: Second, steps: int, usual_s: float) -> np.ndarray:
 
 def _header(name: str, line: bytes) -> Header:
     try:
-        values = json.loads(line)
-        found = values.get("nephron_session", FORMAT) if isinstance(values, dict) else None
-        if found != FORMAT:
-            raise SessionError(f"{name}: not a session, or of another format; expected nephron_session = 1")
-        return Header.model_validate(values)
+        return Header.model_validate(json.loads(line))
     except (ValueError, RecursionError) as error:
-        if isinstance(error, SessionError):
-            raise
+        what = explained(error) if isinstance(error, ValidationError) else "invalid JSON"
         raise SessionError(
-            f"{name}: its first line is no session's; expected a file that rehearse has written, such as session-001.jsonl"
+            f"{name}: not a session of this version ({what}); expected a file that rehearse has written, such as session-001.jsonl"
         ) from None
 
 

@@ -78,41 +78,42 @@ ODD[3] = [0, 0, 0, 2.0]
 @pytest.mark.parametrize(
     ("where", "value", "words"),
     [
-        ("nephron_plan", 2, "nephron_plan: input should be 1"),
-        ("target", "liver", "target: input should be 'margin', 'tumour' or 'organ'"),
-        ("margin_mm", -5.0, "margin_mm: input should be greater than or equal to 0"),
-        ("margin_mm", 1e9, "margin_mm: input should be less"),
-        ("speed_mm_s", 0.0, "speed_mm_s: input should be greater"),
-        ("speed_mm_s", float("inf"), "speed_mm_s: input should be"),
-        ("trocar.cone_deg", 120, "trocar.cone_deg: input should be less than or equal to 90"),
-        ("sweeps", [], "sweeps: list should have at least 1 item"),
-        ("sweeps.0.passes", [], "sweeps.0.passes: list should have at least 1 item"),
-        ("sweeps.0.passes.0", [], "sweeps.0.passes.0: list should have at least 2 items"),
-        ("sweeps.0.passes.0", [np.eye(4).tolist()], "sweeps.0.passes.0: list should have at least 2 items"),
+        ("nephron_plan", 1, "nephron_plan = 1: written by Nephron 1, and this is Nephron 2"),
+        ("target", "liver", "input should be 'margin', 'tumour' or 'organ'"),
+        ("margin_mm", -5.0, "input should be greater than or equal to 0"),
+        ("margin_mm", 1e9, "input should be less"),
+        ("speed_mm_s", 0.0, "input should be greater"),
+        ("speed_mm_s", float("inf"), "input should be"),
+        ("trocar.cone_deg", 120, "input should be less than or equal to 90"),
+        ("sweeps", [], "list should have at least 1 item"),
+        ("sweeps.0.passes", [], "list should have at least 1 item"),
+        ("sweeps.0.passes.0", [], "list should have at least 2 items"),
+        ("sweeps.0.passes.0", [np.eye(4).tolist()], "list should have at least 2 items"),
         (
             "sweeps.0.passes.0.1",
             np.diag([1.0, 1, 1.01, 1]).tolist(),
-            "sweeps.0.passes.0.1: value error, not rigid",
+            "not rigid",
         ),
-        ("sweeps.0.passes.0.1", SHEARED.tolist(), "sweeps.0.passes.0.1: value error, not rigid"),
+        ("sweeps.0.passes.0.1", SHEARED.tolist(), "not rigid"),
         ("sweeps.0.passes.0.1", np.diag([1.0, 1, -1, 1]).tolist(), "three right-handed unit axes"),
         ("sweeps.0.passes.0.1", ODD.tolist(), "a last row of 0 0 0 1"),
         (
             "sweeps.0.passes.0.1",
             np.eye(3).tolist(),
-            "sweeps.0.passes.0.1.0: list should have at least 4 items",
+            "list should have at least 4 items",
         ),
-        ("sweeps.0.passes.0.1.0.3", float("nan"), "sweeps.0.passes.0.1.0.3: input should be a finite number"),
-        ("sweeps.0.passes.0.1.0.3", "far", "sweeps.0.passes.0.1.0.3: input should be a valid number"),
-        ("sweeps.0.parts", dict(path_mm=3.0), "sweeps.0.parts: value error, seen is missing"),
-        ("sweeps.0.parts.seen", float("nan"), "sweeps.0.parts.seen: input should be a finite number"),
-        ("sweeps.0.colour", "red", "sweeps.0.colour: extra inputs are not permitted"),
+        ("sweeps.0.passes.0.1.0.3", float("nan"), "input should be a finite number"),
+        ("sweeps.0.passes.0.1.0.3", "far", "input should be a valid number"),
+        ("sweeps.0.parts", dict(path_mm=3.0), "seen is missing"),
+        ("sweeps.0.parts.seen", float("nan"), "input should be a finite number"),
+        ("sweeps.0.colour", "red", "unknown key"),
     ],
 )
 def test_a_plan_that_cannot_be_used_is_refused_in_one_line(tmp_path, where, value, words):
     values = plan_of().model_dump(mode="json")
     changed(values, where, value)
-    assert words in refused_file(tmp_path, json.dumps(values).encode())
+    refusal = refused_file(tmp_path, json.dumps(values).encode())
+    assert where in refusal and words in refusal
 
 
 @pytest.mark.parametrize(
@@ -128,7 +129,7 @@ def refused_file(tmp_path, content: bytes) -> str:
     with pytest.raises(PlanError) as error:
         read_plan(path)
     told = str(error.value)
-    assert told.startswith(f"{path}: ") and "\n" not in told and len(told) < 400
+    assert told.startswith(f"{path}: ") and "\n" not in told and len(told) < 450
     return told
 
 
@@ -140,7 +141,7 @@ def test_a_turned_pose_is_taken_and_no_file_or_a_folder_refused(tmp_path):
     with pytest.raises(PlanError, match="no such plan; make one with: app.py plan SCENE --out none.json"):
         read_plan(tmp_path / "none.json")
     (tmp_path / "a.png").write_bytes(b"\x89PNG")
-    with pytest.raises(PlanError, match="a.png: not a plan; expected a file that app.py plan wrote"):
+    with pytest.raises(PlanError, match=r"invalid JSON\); expected a file that app.py plan wrote"):
         read_plan(tmp_path / "a.png")
     with pytest.raises(PlanError, match="cannot be read as a plan"):
         read_plan(tmp_path)
@@ -269,4 +270,4 @@ def test_rehearse_refuses_a_plan_of_another_patient_before_it_builds_anything(ba
     (ball_scene / "plan.json").write_text("{}")
     assert app.main(["rehearse", str(ball_scene), "--plan", str(ball_scene / "plan.json")]) == 2
     told = capsys.readouterr().err
-    assert "plan.json: not a plan" in told and told.count("\n") == 1
+    assert "not a plan" in told and told.count("\n") == 1

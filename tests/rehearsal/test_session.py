@@ -38,6 +38,7 @@ from rehearsal.sessions.session_file import (
 from render.viewer import Controls, Settings
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import EMBEDDED, Scene, load_scene
+from version import FORMAT
 
 SECOND = round(1 / STEP_S)
 
@@ -333,15 +334,24 @@ def test_a_damaged_line_is_named_by_its_number(tmp_path):
         read_log(tmp_path / "session")
 
 
+@pytest.mark.parametrize("other", [FORMAT - 1, FORMAT + 1])
+def test_a_session_of_another_format_is_refused_with_its_version(tmp_path, other):
+    values = header().model_dump() | dict(nephron_session=other, unheard_of=1)
+    (tmp_path / "file").write_text(json.dumps(values) + "\n")
+    with pytest.raises(
+        SessionError, match=f"nephron_session = {other}: written by Nephron {other}, and this is"
+    ):
+        read_log(tmp_path / "file")
+
+
 def test_what_is_no_session_is_said_so_in_one_line(tmp_path):
-    version_2 = header().model_dump_json().replace('"nephron_session":1', '"nephron_session":2').encode()
     control, other = (
         header().model_copy(update={name: "1.0\x1b[2J"}).model_dump_json().encode()
         for name in ("version", "arch")
     )
     no_time = header().model_dump_json().replace("0.125", "0").encode()
     strangers = b"", b"\x89PNG\r\n\x1a\n\0\0", b'{"scene": {}}\n', b"[1, 2]\n", b"[" * 100_000
-    for content in (*strangers, version_2, control, other, no_time):
+    for content in (*strangers, control, other, no_time):
         (tmp_path / "file").write_bytes(content)
         with pytest.raises(SessionError, match=r"^file: [^\n]+$"):
             read_log(tmp_path / "file")

@@ -91,6 +91,8 @@ def refused(tmp_path: Path, text: str) -> str:
         ),
         ("[anatomy]\n[[shape]]\nkind = 'ball'", "'plane', 'mesh', 'sdf'"),
         ("[anatomy]\n[organs]\n", "organs: unknown key"),
+        ("nephron_scene = 3\n[brain]\n", "nephron_scene = 3: written by Nephron 3, and this is Nephron 2"),
+        ("nephron_scene = 'two'\n[anatomy]\n", "nephron_scene = 'two': expected 2"),
         ("[anatomy\n", "; expected a scene file (TOML) or a patient's folder"),
         ("[anatomy]\nphantom = true\nct = 'ct.nrrd'", "which has its own files"),
         ("[anatomy]\n[press]\nindentations_mm = [300.0]", "less than or equal to 40"),
