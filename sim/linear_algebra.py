@@ -144,6 +144,12 @@ def rotation_by(vector):
 
 
 @ti.func
+def axial(matrix):
+    """The sum of u x v where a matrix is the sum of v u^T."""
+    return tm.vec3(matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1])
+
+
+@ti.func
 def cross_matrix(a):
     """The matrix M with M b = a x b."""
     return tm.mat3(0.0, -a.z, a.y, a.z, 0.0, -a.x, -a.y, a.x, 0.0)

@@ -11,7 +11,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import Body
-from sim.linear_algebra import cross_matrix, inverse_of, rotation_by
+from sim.linear_algebra import axial, cross_matrix, inverse_of, rotation_by
 from sim.surface_contact import NEAR_MM, SurfaceContacts
 
 # Sums are made in blocks of this many terms, in an order that does not depend on threads.
@@ -27,16 +27,33 @@ REGULARISATION = 1e-5
 MOST_ROTATION = 0.5
 
 
-# The negative derivatives of force and torque are by translation, mixed, and by rotation.
+# Force, torque, and their negative derivatives: by translation, mixed, and by rotation.
 Sums = ti.types.struct(
     force=tm.vec3, torque=tm.vec3, translational=tm.mat3, mixed=tm.mat3, rotational=tm.mat3
+)
+# Of nodes at an arm a from the centre, held to a shift d from there with a stiffness w: sums of w, w a, w d, w a a^T and w d a^T; and the
+# force and torque that give the nodes their velocities.
+Moments = ti.types.struct(
+    stiffness=ti.f32,
+    arm=tm.vec3,
+    shift=tm.vec3,
+    arm_arm=tm.mat3,
+    shift_arm=tm.mat3,
+    force=tm.vec3,
+    torque=tm.vec3,
 )
 
 
 @ti.func
-def nothing():
+def no_sums():
     """Sums of no terms."""
     return Sums(tm.vec3(0.0), tm.vec3(0.0), tm.mat3(0.0), tm.mat3(0.0), tm.mat3(0.0))
+
+
+@ti.func
+def no_moments():
+    """Moments of no nodes."""
+    return Moments(0.0, tm.vec3(0.0), tm.vec3(0.0), tm.mat3(0.0), tm.mat3(0.0), tm.vec3(0.0), tm.vec3(0.0))
 
 
 @ti.data_oriented
@@ -44,7 +61,8 @@ class RigidCorrection:
     """Moves a body's predicted positions rigidly towards ``inertial_target`` (n,) [mm], weighted with ``mass`` (n,) [g],
     and to the places at rest to which a ``tether`` (n,) [g/s^2] holds.
 
-    The unknowns are the translation and the rotation vector about the node ``centre``.
+    The unknowns are the translation and the rotation vector about the node ``centre``. The nodes' forces depend on them by sums that are
+    made once; the contacts' forces are summed in each Newton step.
     """
 
     def __init__(
@@ -64,11 +82,14 @@ class RigidCorrection:
         self.serial = serial
         self.tether: Any = tether
         self.has_tether = tether is not None
-        self.terms = body.count + (contacts.count if contacts else 0)
-        self.blocks = -(-self.terms // BLOCK)
+        self.blocks = -(-body.count // BLOCK)
+        self.contact_blocks = -(-contacts.count // BLOCK) if contacts else 0
         middle = body.rest_points.mean(axis=0)
         self.centre = int(np.linalg.norm(body.rest_points - middle, axis=1).argmin())
-        self.sums = Sums.field(shape=self.blocks)
+        self.moments = Moments.field(shape=self.blocks)
+        self.total_moments = Moments.field(shape=())
+        if self.has_contacts:
+            self.contact_sums = Sums.field(shape=self.contact_blocks)
         # Largest distance of a node from the centre at rest.
         self.extent_mm = float(np.linalg.norm(body.rest_points - middle, axis=1).max())
         self.rotation = ti.Matrix.field(3, 3, ti.f32, ())
@@ -79,17 +100,18 @@ class RigidCorrection:
     @ti.func
     def move(self, dt: float):
         """Move all predicted positions by the rigid part of their velocities, corrected by Newton steps, up to the time of impact."""
+        for block in range(self.blocks):
+            self.sum_nodes(block, dt)
         for _ in range(1):
-            self.rotation[None] = tm.eye(3)
-            self.translation[None] = tm.vec3(0.0)
+            self.begin()
         if ti.static(self.serial):
             for step in range(1 + NEWTON_STEPS):
                 if step < 2 or self.change_mm[None] > CONVERGED_MM:
-                    self.newton_step(step > 0, dt)
+                    self.newton_step(step > 0)
         else:
             # Only outermost loops run in parallel.
             for step in ti.static(range(1 + NEWTON_STEPS_IN_PARALLEL)):
-                self.newton_step(step > 0, dt)
+                self.newton_step(step > 0)
         for _ in range(1):
             self.fraction[None] = 1.0
         if ti.static(self.has_contacts):
@@ -109,63 +131,104 @@ class RigidCorrection:
         return self.translation[None].norm() + rotated > NEAR_MM
 
     @ti.func
-    def newton_step(self, has_forces, dt: float):
-        """One step; the first, without forces, takes the rigid part of the velocities."""
-        for block in range(self.blocks):
-            self.sum_block(block, dt, has_forces)
-        for _ in range(1):
-            self.solve()
-
-    @ti.func
     def moved(self, x):
         """Position of a point after the rigid motion found so far."""
         centre = self.body.position[self.centre]
         return centre + self.translation[None] + self.rotation[None] @ (x - centre)
 
     @ti.func
-    def sum_block(self, block, dt: float, has_forces):
-        """Force, torque and their derivatives of a block's terms: nodes first, then contact points.
-
-        Without ``has_forces`` the forces move the nodes by their velocities and ignore contacts.
-        """
-        sums = nothing()
-        centre = self.body.position[self.centre] + self.translation[None]
-        for term in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.terms)):
-            f, k, x = tm.vec3(0.0), tm.mat3(0.0), centre
-            if term < self.body.count:
-                inertia = self.mass[term] / (dt * dt)
-                x = self.moved(self.body.position[term])
-                f = inertia * dt * self.body.velocity[term]
-                if has_forces:
-                    f = inertia * (self.inertial_target[term] - x)
-                if ti.static(self.has_tether):
-                    if has_forces:
-                        f += self.tether[term] * (self.body.rest[term] - x)
-                    inertia += self.tether[term]
-                k = inertia * tm.eye(3)
-            elif ti.static(self.has_contacts):
-                q = term - self.body.count
-                x = self.moved(self.contacts.point[q])
-                f, k = self.contacts.point_force(q, x, has_forces)
-            arm = cross_matrix(x - centre)
-            sums.force += f
-            sums.torque += arm @ f
-            sums.translational += k
-            sums.mixed -= k @ arm
-            sums.rotational -= arm @ k @ arm
-        self.sums[block] = sums
+    def sum_nodes(self, block, dt: float):
+        """The moments of a block's nodes."""
+        sums = no_moments()
+        centre = self.body.position[self.centre]
+        for i in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.body.count)):
+            x = self.body.position[i]
+            arm = x - centre
+            push = self.mass[i] / dt * self.body.velocity[i]
+            stiffness = self.mass[i] / (dt * dt)
+            shift = stiffness * (self.inertial_target[i] - x)
+            if ti.static(self.has_tether):
+                shift += self.tether[i] * (self.body.rest[i] - x)
+                stiffness += self.tether[i]
+            sums.stiffness += stiffness
+            sums.arm += stiffness * arm
+            sums.shift += shift
+            sums.arm_arm += stiffness * arm.outer_product(arm)
+            sums.shift_arm += shift.outer_product(arm)
+            sums.force += push
+            sums.torque += arm.cross(push)
+        self.moments[block] = sums
 
     @ti.func
-    def solve(self):
-        """Solve the 6 x 6 system by its Schur complement, and add the step to the rigid motion."""
-        total = nothing()
+    def begin(self):
+        """Add the blocks' moments; no motion yet."""
+        total = no_moments()
         for block in range(self.blocks):
-            sums = self.sums[block]
-            total.force += sums.force
-            total.torque += sums.torque
-            total.translational += sums.translational
-            total.mixed += sums.mixed
-            total.rotational += sums.rotational
+            each = self.moments[block]
+            total.stiffness += each.stiffness
+            total.arm += each.arm
+            total.shift += each.shift
+            total.arm_arm += each.arm_arm
+            total.shift_arm += each.shift_arm
+            total.force += each.force
+            total.torque += each.torque
+        self.total_moments[None] = total
+        self.rotation[None] = tm.eye(3)
+        self.translation[None] = tm.vec3(0.0)
+
+    @ti.func
+    def newton_step(self, has_forces):
+        """One step; the first, without forces, takes the rigid part of the velocities and ignores the contacts' forces."""
+        if ti.static(self.has_contacts):
+            for block in range(self.contact_blocks):
+                self.sum_contacts(block, has_forces)
+        for _ in range(1):
+            self.solve(has_forces)
+
+    @ti.func
+    def node_sums(self, has_forces):
+        """Forces of the nodes, and their derivatives: a node at R a is pulled towards a + d, both relative to the moved centre."""
+        of, rotation, translation = self.total_moments[None], self.rotation[None], self.translation[None]
+        arm = rotation @ of.arm
+        arm_arm = rotation @ of.arm_arm @ rotation.transpose()
+        force, torque = of.force, of.torque
+        if has_forces:
+            pull = (of.shift_arm + of.arm_arm) @ rotation.transpose()
+            force = of.shift - of.stiffness * translation - (rotation - tm.eye(3)) @ of.arm
+            torque = axial(pull) - arm.cross(translation)
+        return Sums(
+            force, torque, of.stiffness * tm.eye(3), -cross_matrix(arm), arm_arm.trace() * tm.eye(3) - arm_arm
+        )
+
+    @ti.func
+    def sum_contacts(self, block, has_forces):
+        """Forces of the shapes on a block's contact points, and their derivatives."""
+        sums = no_sums()
+        centre = self.body.position[self.centre] + self.translation[None]
+        for q in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.contacts.count)):
+            if self.contacts.near[q] > 0:
+                x = self.moved(self.contacts.point[q])
+                f, k = self.contacts.point_force(q, x, has_forces)
+                arm = cross_matrix(x - centre)
+                sums.force += f
+                sums.torque += arm @ f
+                sums.translational += k
+                sums.mixed -= k @ arm
+                sums.rotational -= arm @ k @ arm
+        self.contact_sums[block] = sums
+
+    @ti.func
+    def solve(self, has_forces):
+        """Solve the 6 x 6 system by its Schur complement, and add the step to the rigid motion."""
+        total = self.node_sums(has_forces)
+        if ti.static(self.has_contacts):
+            for block in range(self.contact_blocks):
+                sums = self.contact_sums[block]
+                total.force += sums.force
+                total.torque += sums.torque
+                total.translational += sums.translational
+                total.mixed += sums.mixed
+                total.rotational += sums.rotational
         compliance = inverse_of(total.translational)
         schur = total.rotational - total.mixed.transpose() @ compliance @ total.mixed
         # A body collapsed to a line or a point has no resistance to rotation about it.

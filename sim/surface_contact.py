@@ -199,29 +199,23 @@ class SurfaceContacts:
         more than the derivative: so Newton's method converges.
         """
         force, stiffness = tm.vec3(0.0), tm.mat3(0.0)
-        if self.near[q] > 0:
-            penalty = 1e3 * self.stiffness[None] * self.area[q]
-            for s in ti.static(range(len(self.shapes))):
-                plane = self.plane[s, q]
-                normal = plane.xyz
-                shift = p - self.shapes[s].motion(p)
-                depth = plane.w - normal.dot(shift)
-                if (self.near[q] >> s) & 1 and depth > 0.0:
-                    stiffness += penalty * normal.outer_product(normal)
-                    if has_force:
-                        force += penalty * depth * normal
-                        if ti.static(self.friction > 0):
-                            slip = tangential(self.slip[s, q] + shift - self.point[q], normal)
-                            factor = sticking_fraction(
-                                slip, self.coefficient[None] * depth / TANGENTIAL_RATIO
-                            )
-                            force -= penalty * TANGENTIAL_RATIO * factor * slip
-                            stiffness += (
-                                penalty
-                                * TANGENTIAL_RATIO
-                                * factor
-                                * (tm.eye(3) - normal.outer_product(normal))
-                            )
+        penalty = 1e3 * self.stiffness[None] * self.area[q]
+        for s in ti.static(range(len(self.shapes))):
+            plane = self.plane[s, q]
+            normal = plane.xyz
+            shift = p - self.shapes[s].motion(p)
+            depth = plane.w - normal.dot(shift)
+            if (self.near[q] >> s) & 1 and depth > 0.0:
+                stiffness += penalty * normal.outer_product(normal)
+                if has_force:
+                    force += penalty * depth * normal
+                    if ti.static(self.friction > 0):
+                        slip = tangential(self.slip[s, q] + shift - self.point[q], normal)
+                        factor = sticking_fraction(slip, self.coefficient[None] * depth / TANGENTIAL_RATIO)
+                        force -= penalty * TANGENTIAL_RATIO * factor * slip
+                        stiffness += (
+                            penalty * TANGENTIAL_RATIO * factor * (tm.eye(3) - normal.outer_product(normal))
+                        )
         return force, stiffness
 
     @ti.func
