@@ -23,9 +23,9 @@ dask_option = click.option(
 trials_option = click.option(
     "--trials",
     type=WholeRange(MOST_SWEEPS, 100_000),
-    default=96,
+    default=36,
     show_default=True,
-    help="Simulated sweeps in the search for a plan.",
+    help="Simulated passes of the probe in the search for a plan.",
 )
 preset_option = click.option(
     "--quality",

@@ -72,7 +72,6 @@ def sweep_of(*passes: np.ndarray, name: str = "two passes", seen: float = 0.75) 
         score=50.0,
         parts=parts,
         points=dict(seen=75.0),
-        values=dict(depth_mm=1.5),
         trials=8,
         passes=[in_patient(each) for each in passes],
     )

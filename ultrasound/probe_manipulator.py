@@ -124,6 +124,8 @@ def advanced(pose: np.ndarray, depth_mm: float) -> np.ndarray:
 
 def poses_between(start: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
     """Return poses (count + 1, 4, 4) evenly from start to end, as ``interpolated``."""
+    if count == 1:
+        return np.stack([start, end])
     return interpolated(start, end, np.linspace(0.0, 1.0, count + 1))
 
 

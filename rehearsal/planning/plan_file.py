@@ -26,8 +26,8 @@ from ultrasound.target import Target
 from version import FORMAT, of_this_format
 
 MOST_POSES, MOST_MARGIN_MM = 20_000, 30.0
-# The most kinds of sweep that are compared.
-MOST_SWEEPS = 4
+# The most sweeps of a plan, each of another kind.
+MOST_SWEEPS = 2
 SLOWEST_MM_S, FASTEST_MM_S = 1.0, 100.0
 NAME = r"plan-([0-9]{3,9})\.json"
 # The first bytes of a plan contain this.
@@ -51,15 +51,14 @@ class _FileModel(BaseModel):
 class PlannedSweep(_FileModel):
     """One candidate.
 
-    ``parts`` are its ``ScoreTerms`` by name, ``points`` what each adds to the score, ``values`` its parameters. ``passes`` are its poses,
-    probe to patient; the probe's axes are PLUS's (``ultrasound.probe_manipulator``).
+    ``parts`` are its ``ScoreTerms`` by name, ``points`` what each adds to the score, ``trials`` the passes that were tried for it.
+    ``passes`` are its poses, probe to patient; the probe's axes are PLUS's (``ultrasound.probe_manipulator``).
     """
 
     name: str
     score: float
     parts: dict[str, float]
     points: dict[str, float]
-    values: dict[str, float]
     trials: int
     passes: list[Annotated[list[Pose], Field(min_length=2, max_length=MOST_POSES)]] = Field(min_length=1)
 

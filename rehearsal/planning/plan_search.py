@@ -1,120 +1,114 @@
-"""The search for a plan: candidates started on the rigid surrogate, optimised in trials on the deforming organ, and ranked.
+"""The search for a plan: passes varied on the rigid surrogate, then in trials on the deforming organ; the best sets of them are ranked.
 
-Each candidate's parameters are searched by CMA-ES (Hansen 2016, "The CMA evolution strategy: a tutorial"; package cma).
+Both stages are an evolution strategy (Beyer & Schwefel 2002, "Evolution strategies: a comprehensive introduction"): the best set of the
+passes tried so far is varied by random changes.
 """
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from rehearsal.coordinates import probe_in_patient
+from rehearsal.planning.pass_kinds import PassKind, kinds_of
+from rehearsal.planning.pass_selection import best_selection, score_of
 from rehearsal.planning.plan_file import MOST_SWEEPS, Plan, PlanError, PlannedSweep
 from rehearsal.planning.rigid_surrogate import RigidSurrogate
-from rehearsal.planning.sweep_candidates import SweepCandidate, candidates_of
-from rehearsal.planning.sweep_score import ScoreTerms, in_words, points, score, why_better
-from rehearsal.planning.sweep_trial import Trial
+from rehearsal.planning.sweep_score import (
+    ScoreTerms,
+    TriedPass,
+    face_centres,
+    in_words,
+    points,
+    score,
+    why_better,
+)
+from rehearsal.planning.sweep_trial import TRIAL_MM_S, Trial
 from rehearsal.planning.trial_workers import Trials
 from version import VERSION
 
 SEED = 20161130
-# Initial step size as a fraction of the ranges: on the rigid surrogate, then in trials, which start at its optimum.
-SURROGATE_SIGMA, TRIAL_SIGMA = 0.2, 0.06
-# Surrogate evaluations of each candidate, which take as long as so many trials; evaluations in a generation.
-SURROGATE_EVALUATIONS, SURROGATE_TRIALS, GENERATION = 240, 2, 8
-# Trials of the search are faster than the planned sweep.
-TRIAL_MM_S = 60.0
+# On the rigid surrogate: passes at the beginning, rounds of variations, variations in each. They take as long as so many trials.
+BEGINNING, ROUNDS, VARIATIONS, SURROGATE_TRIALS = 150, 6, 25, 4
+# Standard deviation of a variation, as a fraction of a parameter's range: on the surrogate, and in trials.
+SURROGATE_SIGMA, TRIAL_SIGMA = 0.08, 0.06
+# Trials in a round.
+ROUND_TRIALS = 8
+# A sweep has about this path [mm], for the time that the last computation takes.
+USUAL_PATH_MM = 250.0
 DIGITS = 6
 Progress = Callable[[int], Any]
 # The score terms of a path, and the poses (n, 4, 4) of its passes: probe in the patient, in PLUS's axes (LPS, mm).
 TriedPath = tuple[ScoreTerms, list[np.ndarray]]
 
 
-@dataclass
-class CandidateSearch:
-    """The search of one candidate's parameters; deterministic.
+class PassSearch:
+    """The search for the best set of passes of one kind; deterministic. ``tried`` are the passes so far, ``best`` the best set of them."""
 
-    ``best`` (n,) are the best parameters so far, scaled to 0 to 1; empty before the first trial.
-    """
-
-    candidate: SweepCandidate
-    start: np.ndarray
-    sigma: float
-    best: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    score: float = -np.inf
-    trials: int = 0
-
-    def __post_init__(self) -> None:
-        # Imported here: it takes two seconds, which a window without a plan need not wait for.
-        import cma
-
-        random = np.random.default_rng(SEED)
-        # By default cma draws from NumPy's global generator, and seeds it.
-        options = dict(
-            bounds=[0.0, 1.0],
-            seed=np.nan,
-            randn=lambda *size: random.standard_normal(size),
-            popsize=GENERATION,
-            verbose=-9,
-        )
-        self._strategy_from = partial(cma.CMAEvolutionStrategy, sigma0=self.sigma, inopts=options)
-        self._strategy = self._strategy_from(self.start)
+    def __init__(self, kind: PassKind, sigma: float) -> None:
+        self.kind, self.sigma = kind, sigma
+        self.tried: list[TriedPass] = []
+        self.best: list[TriedPass] = []
+        self._random = np.random.default_rng(SEED)
 
     @property
-    def values(self) -> dict[str, float]:
-        """The best parameters so far, by name."""
-        return self.candidate.values(self.best)
+    def score(self) -> float:
+        """The score of the best set, about; minus infinity before a trial."""
+        return score_of(self.best)
 
-    def ask(self) -> list[np.ndarray]:
-        """The next generation. The first contains ``start`` and the candidate's own default."""
-        asked = self._strategy.ask()
-        return [self.start, self.candidate.start(), *asked[2:]] if self.trials == 0 else asked
+    def first(self, count: int) -> list[np.ndarray]:
+        """Parameters for the beginning: straight rows and random passes."""
+        rows = self.kind.rows()
+        return rows + self.kind.random(self._random, count - len(rows))
 
-    def tell(self, asked: list[np.ndarray], scores: list[float]) -> None:
-        """Take the scores of a generation; the last one may be incomplete.
+    def variations(self, count: int) -> list[np.ndarray]:
+        """Parameters of the best set's passes with random changes: of each pass a large one, then a small one."""
+        found = []
+        for number in range(count if self.best else 0):
+            times, which = divmod(number, len(self.best))
+            sigma = self.sigma / (1 + times % 2)
+            parameters = self.best[which].parameters
+            found.append(
+                np.clip(parameters + sigma * self._random.standard_normal(parameters.shape), 0.0, 1.0)
+            )
+        return found
 
-        The search restarts at the candidate's default where that was the best of the first generation.
-        """
-        best, is_first = int(np.argmax(scores)), self.trials == 0
-        self.trials += len(asked)
-        if scores[best] > self.score:
-            self.score, self.best = scores[best], asked[best]
-        if is_first and best == 1:
-            self._strategy = self._strategy_from(asked[1])
-        elif len(asked) == GENERATION:
-            self._strategy.tell(asked, [-each for each in scores])
+    def add(self, passes: Sequence[TriedPass | None]) -> None:
+        """Add tried passes; None is one that the instrument cannot hold."""
+        self.tried += [each for each in passes if each is not None]
+        self.best = best_selection(self.tried)
 
 
 # What the processes compute, each with its trial.
 
 
-def search_space(trial: Trial) -> tuple[list[SweepCandidate], dict[str, float | int | str]]:
-    """The candidates, and what the tissue is computed with."""
+def search_space(trial: Trial) -> tuple[list[PassKind], dict[str, float | int | str]]:
+    """The kinds of pass, and what the tissue is computed with."""
     rehearsal, step = trial.rehearsal, trial.rehearsal.settings
     solver = dict(time_step_s=step.time_step_s, substeps=step.substeps, iterations=step.iterations)
     model = rehearsal.scene.tissue.model_dump(mode="json") | solver | rehearsal.model.counts()
-    return candidates_of(trial), model
+    return kinds_of(trial), model
 
 
-def surrogate_optimum(trial: Trial, candidate: SweepCandidate) -> np.ndarray:
-    """The parameters (n,), scaled to 0 to 1, with the best score on the rigid surrogate."""
-    trial.rehearsal.reset()
-    surrogate = RigidSurrogate(trial)
-    search = CandidateSearch(candidate, candidate.start(), SURROGATE_SIGMA)
-    while search.trials < SURROGATE_EVALUATIONS:
-        asked = search.ask()
-        paths = [candidate.path(surrogate.manipulator, candidate.values(scaled)) for scaled in asked]
-        search.tell(asked, [score(surrogate.evaluate(path)) for path in paths])
+def surrogate_search(trial: Trial, kind: PassKind) -> list[TriedPass]:
+    """The best set of passes of a kind on the rigid surrogate."""
+    surrogate, search = RigidSurrogate(trial), PassSearch(kind, SURROGATE_SIGMA)
+    search.add([surrogate.try_pass(kind, each) for each in search.first(BEGINNING)])
+    for _ in range(ROUNDS):
+        search.add([surrogate.try_pass(kind, each) for each in search.variations(VARIATIONS)])
     return search.best
 
 
-def try_candidate(
-    trial: Trial, candidate: SweepCandidate, values: dict[str, float], speed_mm_s: float
-) -> TriedPath:
-    """Try a candidate with its parameters, at a speed on its passes."""
-    return try_path(trial, lambda of: candidate.path(of.rehearsal.manipulator, values), speed_mm_s)
+def try_pass(trial: Trial, kind: PassKind, parameters: np.ndarray) -> TriedPass | None:
+    """Try one pass; None where the instrument cannot hold it."""
+    poses = kind.poses(trial.rehearsal.manipulator, kind.values(parameters))
+    return None if poses is None or not trial.reach(poses).all() else trial.try_pass(parameters, poses)
+
+
+def try_sweep(trial: Trial, kind: PassKind, parameters: list[np.ndarray], speed_mm_s: float) -> TriedPath:
+    """Try passes of a kind, one after the other, at a speed."""
+    return try_path(trial, lambda of: _in_order(of, kind, parameters), speed_mm_s)
 
 
 def try_path(trial: Trial, make: Callable[[Trial], list[np.ndarray]], speed_mm_s: float) -> TriedPath:
@@ -124,42 +118,54 @@ def try_path(trial: Trial, make: Callable[[Trial], list[np.ndarray]], speed_mm_s
     return terms, [np.stack([probe_in_patient(trial.rehearsal, pose) for pose in each]) for each in passes]
 
 
+def _in_order(trial: Trial, kind: PassKind, parameters: list[np.ndarray]) -> list[np.ndarray]:
+    """The passes, each the one that begins nearest to the end of the one before."""
+    manipulator = trial.rehearsal.manipulator
+    poses = [kind.poses(manipulator, kind.values(each)) for each in parameters]
+    left = [each for each in poses if each is not None]
+    ordered = [left.pop(0)]
+    while left:
+        end = face_centres(manipulator, ordered[-1][-1:])[0]
+        begins = np.stack([face_centres(manipulator, each[:1])[0] for each in left])
+        ordered.append(left.pop(int(np.linalg.norm(begins - end, axis=1).argmin())))
+    return ordered
+
+
 # The search
 
 
 def total_work(trials: int, speed_mm_s: float) -> int:
     """The work of ``make_plan`` at most, in trials."""
-    return trials + MOST_SWEEPS * (SURROGATE_TRIALS + work_at(speed_mm_s))
+    return trials + 3 * SURROGATE_TRIALS + MOST_SWEEPS * work_at(speed_mm_s)
 
 
 def work_at(speed_mm_s: float) -> int:
-    """The work of one sweep at a speed, in trials: half of a trial's time does not depend on the speed."""
-    return max(1, round((1 + TRIAL_MM_S / speed_mm_s) / 2))
+    """The work of one sweep at a speed, in trials of a pass."""
+    return max(1, round(USUAL_PATH_MM / 50.0 * (1 + TRIAL_MM_S / speed_mm_s) / 2))
 
 
 def make_plan(workers: Trials, speed_mm_s: float, trials: int, progress: Progress) -> Plan:
     """Search a plan for the workers' problem. Raises PlanError where no sweep is reachable.
 
-    ``progress`` is called with 0 when the search begins, then with the work done, in trials; the sum is ``total_work``.
+    ``progress`` is called with 0 when the search begins, then with the work done, in trials; the sum is at most ``total_work``.
     """
     problem = workers.problem
-    ((candidates, model),) = workers.map(search_space, [()])
+    ((kinds, model),) = workers.map(search_space, [()])
     progress(0)
-    searches = search(candidates, workers, trials, progress)
-    rows = [row for row in ranked(searches, workers, speed_mm_s, progress) if row[2]]
-    if not rows or rows[0][1].reachable < 1.0:
+    searches = search(kinds, workers, trials, progress)
+    if not searches:
         raise PlanError(
             "no sweep was found that an instrument through the trocar can hold at all poses; move the trocar, widen its cone, "
             "or give the search more --trials"
         )
+    rows = ranked(searches, workers, speed_mm_s, progress)
     sweeps = [
         PlannedSweep(
-            name=one.candidate.name(len(passes)),
+            name=one.kind.name(len(passes)),
             score=round(score(terms), DIGITS),
             parts=_rounded(asdict(terms)),
             points=_rounded(points(terms)),
-            values=_rounded(one.values),
-            trials=one.trials,
+            trials=len(one.tried),
             passes=[np.round(each, DIGITS).tolist() for each in passes],
         )
         for one, terms, passes in rows
@@ -184,50 +190,51 @@ def make_plan(workers: Trials, speed_mm_s: float, trials: int, progress: Progres
     )
 
 
-def search(
-    candidates: list[SweepCandidate], workers: Trials, trials: int, progress: Progress
-) -> list[CandidateSearch]:
-    """Search all candidates with a total of trials: one generation of each, then the better half with the rest."""
-    searches = []
-    optima = workers.map(surrogate_optimum, [(each,) for each in candidates])
-    for candidate, start in zip(candidates, optima, strict=True):
-        searches.append(CandidateSearch(candidate, start, TRIAL_SIGMA))
+def search(kinds: list[PassKind], workers: Trials, trials: int, progress: Progress) -> list[PassSearch]:
+    """The kinds with the best sets on the surrogate, and their searches in so many trials; the better one gets what is left after the first round."""
+    rough = []
+    for kind, best in zip(kinds, workers.map(surrogate_search, [(kind,) for kind in kinds]), strict=True):
         progress(SURROGATE_TRIALS)
-    left = trials - _generation(searches, workers, trials, progress)
-    better = sorted(searches, key=lambda one: -one.score)[: -(-len(searches) // 2)]
-    while left > 0:
-        left -= _generation(better, workers, left, progress)
+        if best:
+            rough.append((kind, best))
+    rough = sorted(rough, key=lambda each: -score_of(each[1]))[:MOST_SWEEPS]
+    searches = [PassSearch(kind, TRIAL_SIGMA) for kind, _ in rough]
+    first = [[each.parameters for each in best] for _, best in rough]
+    trials -= _try(searches, first, workers, trials, progress)
+    searches = sorted((one for one in searches if one.best), key=lambda one: -one.score)
+    while searches and trials > 0:
+        better = searches[0]
+        trials -= _try([better], [better.variations(ROUND_TRIALS)], workers, trials, progress)
     return searches
 
 
-def _generation(active: list[CandidateSearch], workers: Trials, most: int, progress: Progress) -> int:
-    """Run one generation of each search, with at most so many trials; return how many were run."""
-    share = [most // len(active) + (number < most % len(active)) for number in range(len(active))]
-    asked = [one.ask()[:count] for one, count in zip(active, share, strict=True)]
-    tasks = [
-        (one.candidate, one.candidate.values(scaled), TRIAL_MM_S)
-        for one, generation in zip(active, asked, strict=True)
-        for scaled in generation
-    ]
-    scores = []
-    for terms, _ in workers.map(try_candidate, tasks):
-        scores.append(score(terms))
+def _try(
+    searches: list[PassSearch],
+    parameters: list[list[np.ndarray]],
+    workers: Trials,
+    most: int,
+    progress: Progress,
+) -> int:
+    """Try passes for each search, at most so many in all; return how many were tried."""
+    tasks = [(one, each) for one, asked in zip(searches, parameters, strict=True) for each in asked][:most]
+    found: list[tuple[PassSearch, TriedPass | None]] = []
+    for (one, _), tried in zip(
+        tasks, workers.map(try_pass, [(o.kind, each) for o, each in tasks]), strict=True
+    ):
+        found.append((one, tried))
         progress(1)
-    for one, generation in zip(active, asked, strict=True):
-        if generation:
-            one.tell(generation, scores[: len(generation)])
-            scores = scores[len(generation) :]
+    for one in searches:
+        one.add([tried for searched, tried in found if searched is one])
     return len(tasks)
 
 
 def ranked(
-    searches: list[CandidateSearch], workers: Trials, speed_mm_s: float, progress: Progress
-) -> list[tuple[CandidateSearch, ScoreTerms, list[np.ndarray]]]:
-    """The best of each candidate, tried once more at the planned speed; highest score first."""
-    tried = [one for one in searches if one.trials]
-    tasks = [(one.candidate, one.values, speed_mm_s) for one in tried]
+    searches: list[PassSearch], workers: Trials, speed_mm_s: float, progress: Progress
+) -> list[tuple[PassSearch, ScoreTerms, list[np.ndarray]]]:
+    """The best set of each search as a sweep at the planned speed; highest score first."""
+    tasks = [(one.kind, [each.parameters for each in one.best], speed_mm_s) for one in searches]
     rows = []
-    for one, (terms, passes) in zip(tried, workers.map(try_candidate, tasks), strict=True):
+    for one, (terms, passes) in zip(searches, workers.map(try_sweep, tasks), strict=True):
         rows.append((one, terms, passes))
         progress(work_at(speed_mm_s))
     return sorted(rows, key=lambda row: -score(row[1]))

@@ -1,11 +1,12 @@
-"""The rigid surrogate: score terms of a path if the settled organ did not deform. Rough, and a hundred times faster than a trial."""
+"""The rigid surrogate: what a pass shows if the settled organ does not deform. Rough, and a hundred times faster than a trial."""
 
 import copy
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from rehearsal.planning.sweep_score import ScoreTerms, path_mm
+from rehearsal.planning.pass_kinds import PassKind
+from rehearsal.planning.sweep_score import TriedPass
 from rehearsal.planning.sweep_trial import Trial
 from sim.fields import array_of
 from sim.signed_distance import distance_grid
@@ -13,18 +14,19 @@ from sim.skinning import Skin
 from ultrasound.coverage import REACH_MM, VOXEL_MM
 from ultrasound.probe_manipulator import image_plane
 
-# The most places of the target and elements of the array that are evaluated.
-PLACES, ELEMENTS = 1500, 32
+# The most elements of the array that are evaluated.
+ELEMENTS = 32
 
 
 class RigidSurrogate:
-    """Evaluates paths on the settled organ of a trial. Its ``manipulator`` has fewer samples of the surface than the trial's."""
+    """Evaluates passes on the settled organ of a trial. Its ``manipulator`` has fewer samples of the surface than the trial's."""
 
     def __init__(self, trial: Trial) -> None:
         self.trial = trial
+        trial.rehearsal.reset()
         self.manipulator = copy.copy(trial.rehearsal.manipulator)
         self.manipulator.samples = self.manipulator.vertices
-        settled = Skin(trial.rehearsal.model, trial.places[:: -(-len(trial.places) // PLACES)])
+        settled = Skin(trial.rehearsal.model, trial.sampled_places)
         settled.update()
         self._places = array_of(settled.vertices).astype(float)
         self._distance, self._low_mm = distance_grid(
@@ -33,18 +35,19 @@ class RigidSurrogate:
         elements = trial.rehearsal.probe.elements()
         self._elements = elements[np.linspace(0, len(elements) - 1, ELEMENTS).astype(int)]
 
-    def evaluate(self, passes: list[np.ndarray]) -> ScoreTerms:
-        """The score terms on the rigid organ; compression is the depth of the array below its surface, and time is 0."""
-        if not passes:
-            return self.trial.terms([], [], [])
-        rehearsal, poses = self.trial.rehearsal, np.concatenate(passes)
+    def try_pass(self, kind: PassKind, parameters: np.ndarray) -> TriedPass | None:
+        """A pass over the rigid organ; None where the instrument cannot hold it. Compression is the depth of the array below the surface."""
+        poses = kind.poses(self.manipulator, kind.values(parameters))
+        if poses is None or not self.trial.reach(poses).all():
+            return None
+        rehearsal = self.trial.rehearsal
         planes = image_plane(poses, rehearsal.size_mm[2], 1.0, 1.0).world_from_plane
         outside = self._outside_mm(planes)
         touches = outside <= rehearsal.scene.image.contact_gap_mm
-        seen = float(self._covered(planes, touches).mean())
-        depths, contacts = np.maximum(-outside.min(axis=1), 0.0), touches.mean(axis=1)
-        length = path_mm(self.manipulator, poses)
-        return self.trial.terms(passes, depths.tolist(), contacts.tolist(), seen=seen, path_mm=length)
+        depths = np.maximum(-outside.min(axis=1), 0.0)
+        return self.trial.tried(
+            parameters, poses, self._covered(planes, touches), depths, touches.mean(axis=1)
+        )
 
     def _outside_mm(self, planes: np.ndarray) -> np.ndarray:
         """The signed distance (n, k) of each element on planes (n, 4, 4) from the settled surface, negative inside."""

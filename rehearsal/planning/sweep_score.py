@@ -41,6 +41,24 @@ class ScoreTerms:
     """Fraction of poses that an instrument through the trocar can hold."""
 
 
+# The terms that are means over a sweep's poses.
+MEANS = ("compression_mean_mm", "over_limit", "contact", "incidence_deg")
+
+
+@dataclass(frozen=True)
+class TriedPass:
+    """``parameters`` (n,) of a pass, scaled to 0 to 1, and what it does alone: ``seen`` (p,), sampled places of the target, and its ``path_mm``.
+
+    ``sums`` (4,) are the ``MEANS``, summed over its ``poses``.
+    """
+
+    parameters: np.ndarray
+    seen: np.ndarray
+    sums: np.ndarray
+    poses: int
+    path_mm: float
+
+
 def face_centres(manipulator: ProbeManipulator, poses: np.ndarray) -> np.ndarray:
     """The centres (n, 3) of the array face at poses (n, 4, 4) [mm]."""
     return poses[:, :3, 3] - manipulator.size_mm[2] / 2 * poses[:, :3, 2]

@@ -1,5 +1,6 @@
 """A trial of a sweep on the deforming organ, as the transducer would be driven: its score terms."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -8,7 +9,7 @@ import numpy as np
 
 from rehearsal.planning.instrument_reach import reachable
 from rehearsal.planning.plan_file import DEG_PER_MM, LIFT_MM, PlanError
-from rehearsal.planning.sweep_score import ScoreTerms, face_centres, incidence_deg
+from rehearsal.planning.sweep_score import MEANS, ScoreTerms, TriedPass, face_centres, incidence_deg, path_mm
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import Scene, Trocar
@@ -20,10 +21,14 @@ from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import advanced, poses_between
 from ultrasound.target import Target
 
+# The most places of the target that are looked at in a search.
+PLACES = 1500
+# Passes of a search are tried at this speed, from so near above the first pose [mm].
+TRIAL_MM_S, ABOVE_MM = 60.0, 2.0
 # The most steps of a move between passes.
 MOST_STEPS = 240
-# Poses from a file are rounded: an excess of this fraction of a step does not add a step.
-ROUNDED_STEPS = 1e-3
+# Poses from a file are rounded: an excess of this fraction of a step, or this distance, does not add a step.
+ROUNDED_STEPS, ROUNDED_MM = 1e-3, 1e-4
 
 
 @dataclass(frozen=True)
@@ -60,7 +65,10 @@ class PlanningProblem:
 
 
 class Trial:
-    """Tries paths in one rehearsal, each from the settled organ; ``places`` (n, 3) are the target's voxels. Raises PlanError."""
+    """Tries sweeps and single passes in one rehearsal, each from the settled organ. Raises PlanError.
+
+    ``places`` (n, 3) are the target's voxels, ``sampled_places`` (p, 3) those that a search looks at.
+    """
 
     def __init__(self, problem: PlanningProblem) -> None:
         self.rehearsal = Rehearsal(problem.scene, problem.anatomy, problem.probe)
@@ -71,25 +79,18 @@ class Trial:
             raise PlanError(
                 f"--target {self.target}: it is smaller than a voxel of {VOXEL_MM:g} mm; expected a larger one"
             )
+        self._sampled = slice(None, None, -(-len(self.places) // PLACES))
+        self.sampled_places = self.places[self._sampled]
         held, origin = self.rehearsal.manipulator, self.rehearsal.origin
         self.reach = partial(reachable, problem.trocar, held, origin, self.places.mean(axis=0))
         self.plane = PlaneInTissue(self.rehearsal.embedding, GRID_POINTS)
 
     def run(self, passes: list[np.ndarray], speed_mm_s: float) -> ScoreTerms:
         """Follow a path at a speed on its passes; deterministic."""
-        self.rehearsal.reset()
-        self.coverage.clear()
-        self._compressions: list[float] = []
-        self._contacts: list[float] = []
-        self._restored: list[bool] = []
-        self._was_restored = False
-        self._path_mm, self._steps_taken, self._speed_mm_s = 0.0, 0, speed_mm_s
+        self._begin(speed_mm_s)
         for poses in passes:
             self._approach(poses[0])
-            self._measure()
-            for start, end in pairwise(poses):
-                self._move(start, end)
-                self._measure()
+            self._follow(poses)
         return self.terms(
             passes,
             self._compressions,
@@ -103,8 +104,8 @@ class Trial:
     def terms(
         self,
         passes: list[np.ndarray],
-        compression_mm: list[float],
-        contact: list[float],
+        compression_mm: Sequence[float],
+        contact: Sequence[float],
         restored: np.ndarray | bool = False,
         **others: float,
     ) -> ScoreTerms:
@@ -123,6 +124,47 @@ class Trial:
             **others,
         )
 
+    def try_pass(self, parameters: np.ndarray, poses: np.ndarray) -> TriedPass:
+        """Follow one pass (n, 4, 4) from close above its first pose; deterministic."""
+        self._begin(TRIAL_MM_S)
+        self.rehearsal.pose = advanced(poses[0], -ABOVE_MM)
+        self._move(self.rehearsal.pose, poses[0])
+        self._follow(poses)
+        seen = self.coverage.seen[self.coverage.targets[self.target]][self._sampled]
+        return self.tried(
+            parameters, poses, seen, self._compressions, self._contacts, np.array(self._restored)
+        )
+
+    def tried(
+        self,
+        parameters: np.ndarray,
+        poses: np.ndarray,
+        seen: np.ndarray,
+        compression_mm: Sequence[float],
+        contact: Sequence[float],
+        restored: np.ndarray | bool = False,
+    ) -> TriedPass:
+        """A pass with what it has ``seen`` (p,), and the compression and contact at each of its poses."""
+        terms = self.terms([poses], compression_mm, contact, restored)
+        sums = len(poses) * np.array([getattr(terms, name) for name in MEANS])
+        return TriedPass(parameters, seen, sums, len(poses), path_mm(self.rehearsal.manipulator, poses))
+
+    def _begin(self, speed_mm_s: float) -> None:
+        self.rehearsal.reset()
+        self.coverage.clear()
+        self._compressions: list[float] = []
+        self._contacts: list[float] = []
+        self._restored: list[bool] = []
+        self._was_restored = False
+        self._path_mm, self._steps_taken, self._speed_mm_s = 0.0, 0, speed_mm_s
+
+    def _follow(self, poses: np.ndarray) -> None:
+        """From the first pose, where the probe is, to the last, with measurements at each."""
+        self._measure()
+        for start, end in pairwise(poses):
+            self._move(start, end)
+            self._measure()
+
     def _approach(self, pose: np.ndarray) -> None:
         """Lift the probe, move it above a pose as the probe manipulator does, around the organ, and lower it there."""
         rehearsal = self.rehearsal
@@ -131,7 +173,7 @@ class Trial:
         else:
             for goal in (advanced(rehearsal.pose, -LIFT_MM), advanced(pose, -LIFT_MM)):
                 for _ in range(MOST_STEPS):
-                    if np.allclose(rehearsal.pose, goal, atol=1e-6):
+                    if np.allclose(rehearsal.pose, goal, rtol=0.0, atol=ROUNDED_MM):
                         break
                     self._step(rehearsal.pose_towards(goal))
         self._move(rehearsal.pose, pose)

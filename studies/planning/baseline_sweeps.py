@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from rehearsal.planning.pass_kinds import DEFAULT_DEPTH_MM, target_from
 from rehearsal.planning.plan_file import PlannedSweep
 from rehearsal.planning.plan_guidance import passes_in
-from rehearsal.planning.sweep_candidates import DEFAULT_DEPTH_MM, target_from
 from rehearsal.planning.sweep_path import sliding, turned
 from rehearsal.planning.sweep_trial import Trial
 from ultrasound.probe_manipulator import rigid

@@ -17,7 +17,7 @@ from rehearsal import headless, worker_processes
 from rehearsal.planning import plan_search
 from rehearsal.planning.plan_file import Plan, read_plan
 from rehearsal.planning.sweep_path import frame_towards, sliding
-from rehearsal.planning.sweep_score import ScoreTerms
+from rehearsal.planning.sweep_score import MEANS, ScoreTerms
 from rehearsal.planning.sweep_trial import Trial
 from studies.planning.baseline_sweeps import planned
 from ultrasound.probe_manipulator import advanced, indentation
@@ -54,7 +54,8 @@ class Made:
 def made(tmp_path_factory, cluster) -> Iterator[Made]:
     folder = folder_of_ball(tmp_path_factory.mktemp("ball"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plan_search, "SURROGATE_EVALUATIONS", 8)
+        for name, few in dict(BEGINNING=24, ROUNDS=1, VARIATIONS=4).items():
+            patch.setattr(plan_search, name, few)
         patch.setattr(worker_processes, "ProcessPoolExecutor", Here)
         patch.setattr(headless, "open_viewer", lambda *_, **__: None)
         said = planned_into(folder / "plan.json", "--dask", cluster)
@@ -142,6 +143,18 @@ def test_a_trial_gives_the_same_figures_twice_whatever_was_tried_between(trial):
     first = run(trial, path)
     run(trial, path_at(trial, 6.0))
     assert run(trial, path) == first
+
+
+def test_a_pass_tried_alone_has_the_terms_of_a_sweep_of_it(trial):
+    (poses,) = path_at(trial, 2.0)
+    alone, terms = trial.try_pass(np.zeros(1), poses), run(trial, [poses])
+    # It begins nearer to the organ, so that the first pose finds tissue that moves less.
+    assert alone.seen.mean() == pytest.approx(terms.seen, abs=0.02) and alone.poses == len(poses)
+    means = dict(zip(MEANS, alone.sums / alone.poses, strict=True))
+    assert means == pytest.approx({name: getattr(terms, name) for name in MEANS}, rel=0.05, abs=0.02)
+    assert alone.path_mm < terms.path_mm < alone.path_mm + 7.0
+    again = trial.try_pass(np.zeros(1), poses)
+    assert np.array_equal(again.seen, alone.seen) and np.array_equal(again.sums, alone.sums)
 
 
 def test_a_deeper_path_has_more_compression_and_contact(trial):

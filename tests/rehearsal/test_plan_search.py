@@ -1,7 +1,6 @@
-"""The search for a plan: candidate_search, who has how many trials, and what a plan is made of; with processes that only count."""
+"""The search for a plan: variations, who has how many trials, and what a plan is made of; with processes that only count."""
 
 import re
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from types import SimpleNamespace
@@ -12,25 +11,26 @@ import trimesh
 from plan_ball import GOOD, big_ball, from_above, manipulator_on, straight_pass
 
 from rehearsal.planning import plan_search
-from rehearsal.planning.plan_file import PlanError, read_plan, write_plan
+from rehearsal.planning.pass_kinds import RANGES, PassKind
+from rehearsal.planning.pass_selection import best_selection, score_of
+from rehearsal.planning.plan_file import MOST_SWEEPS, PlanError, read_plan, write_plan
 from rehearsal.planning.plan_search import (
-    GENERATION,
+    ROUND_TRIALS,
     SURROGATE_TRIALS,
-    TRIAL_MM_S,
     TRIAL_SIGMA,
-    CandidateSearch,
+    PassSearch,
     TriedPath,
     make_plan,
     ranked,
     search,
     search_space,
-    surrogate_optimum,
+    surrogate_search,
     total_work,
-    try_candidate,
+    try_pass,
     try_path,
+    try_sweep,
 )
-from rehearsal.planning.sweep_candidates import SweepCandidate
-from rehearsal.planning.sweep_score import ScoreTerms, score
+from rehearsal.planning.sweep_score import ScoreTerms, TriedPass, score
 from rehearsal.planning.sweep_trial import PlanningProblem, Trial
 from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import Scene, Trocar
@@ -38,53 +38,63 @@ from studies.planning import plan_comparison
 from studies.planning.plan_comparison import table
 from ultrasound.probe import load_probe
 
-BEST = dict(a_mm=-3.0, b_mm=7.0, c_deg=20.0)
-RANGES = dict(a_mm=(-10, 10, 0), b_mm=(0, 8, 2), c_deg=(-45, 45, -30))
+PLACES = np.linspace(-1.0, 1.0, 201)
 
 
-def candidate(name: str, handicap: float = 0.0) -> SweepCandidate:
-    """One that is worth less by a handicap, which its count carries."""
-    return SweepCandidate(name, "slide", int(100 * handicap), from_above(), RANGES)
+def kind(side: str, motion: str = "slide") -> PassKind:
+    return PassKind(side, motion, from_above(), np.array([10.0, 8.0]), 9.0)
 
 
-def worth(values: dict[str, float], handicap: float = 0.0) -> ScoreTerms:
-    """Best in one place, and known how good there: how much is seen falls with the square of the distance."""
-    off = sum(((values[name] - BEST[name]) / np.ptp(RANGES[name][:2])) ** 2 for name in BEST)
-    return replace(GOOD, seen=1.0 - handicap - off)
+def trial_of(kind: PassKind, parameters: np.ndarray, handicap: float = 0.0) -> TriedPass:
+    """A pass sees the places around its own, the more of them the less it leans."""
+    values = kind.values(parameters)
+    reach = (0.3 - handicap) * (1 - abs(values["lean_deg"]) / 80)
+    seen = np.abs(PLACES - values["aside"]) < reach
+    return TriedPass(parameters, seen, 20 * np.array([1.0, 0.0, 0.8, 10.0]), 20, 16.0)
 
 
 class Counting:
-    """No processes: a way is worth what its numbers say, and every task is written down."""
+    """No processes: a pass is worth what its numbers say, and every task is written down. Sides have handicaps."""
 
-    def __init__(self, candidates: list[SweepCandidate], reachable: float = 1.0, ways: int = 1) -> None:
-        self.candidates, self.reachable, self.ways = candidates, reachable, ways
+    def __init__(self, handicaps: dict[str, float], reachable: bool = True) -> None:
+        self.kinds = [kind(side) for side in handicaps]
+        self.handicaps, self.reachable = handicaps, reachable
         self.problem = problem_of()
-        self.tasks: list[tuple[SweepCandidate, dict[str, float], float]] = []
-        self.surrogate_optima = 0
+        self.passes: list[tuple[str, np.ndarray]] = []
+        self.sweeps: list[tuple[str, list[np.ndarray], float]] = []
 
     def map(self, function, tasks) -> Iterator:
-        stand_ins = {search_space: self.space, surrogate_optimum: self.optimum, try_candidate: self.tried}
+        stand_ins = {
+            search_space: self.space,
+            surrogate_search: self.on_surrogate,
+            try_pass: self.tried,
+            try_sweep: self.swept,
+        }
         for number, task in enumerate(tasks):
             if function is try_path:
                 yield replace(GOOD, seen=0.1 * number), [straight_pass(4)]
             else:
                 yield stand_ins[function](*task)
 
-    def space(self) -> tuple[list[SweepCandidate], dict]:
-        return self.candidates, dict(model="neo-hookean", cell_mm=8.0)
+    def space(self) -> tuple[list[PassKind], dict]:
+        return self.kinds, dict(model="neo-hookean", cell_mm=8.0)
 
-    def optimum(self, candidate: SweepCandidate) -> np.ndarray:
-        self.surrogate_optima += 1
-        return candidate.start()
+    def on_surrogate(self, kind: PassKind) -> list[TriedPass]:
+        rows = [trial_of(kind, each, self.handicaps[kind.side]) for each in kind.rows()]
+        return best_selection(rows) if self.reachable else []
 
-    def tried(self, candidate: SweepCandidate, values: dict[str, float], speed: float) -> TriedPath:
-        self.tasks.append((candidate, values, speed))
-        terms = replace(worth(values, candidate.count / 100), reachable=self.reachable)
-        return terms, [straight_pass(4)] * self.ways
+    def tried(self, kind: PassKind, parameters: np.ndarray) -> TriedPass:
+        self.passes.append((kind.side, parameters))
+        return trial_of(kind, parameters, self.handicaps[kind.side])
+
+    def swept(self, kind: PassKind, parameters: list[np.ndarray], speed: float) -> TriedPath:
+        self.sweeps.append((kind.side, parameters, speed))
+        seen = np.any([trial_of(kind, each, self.handicaps[kind.side]).seen for each in parameters], axis=0)
+        return replace(GOOD, seen=float(seen.mean())), [straight_pass(4)] * len(parameters)
 
 
-def four() -> list[SweepCandidate]:
-    return [candidate(f"sweep {n}", handicap) for n, handicap in enumerate((0.3, 0.0, 0.2, 0.1))]
+def three(**changes) -> Counting:
+    return Counting({"side 0": 0.1, "side 1": 0.0, "side 2": 0.05}, **changes)
 
 
 def problem_of(**changes) -> PlanningProblem:
@@ -97,152 +107,131 @@ def with_tumour(**changes) -> PlanningProblem:
     return problem_of(anatomy=LoadedAnatomy(big_ball(), big_ball(), None, ()), **changes)
 
 
-# CMA-ES
+# Variations
 
 
-def evolved(generations: int, beside: bool = False) -> CandidateSearch:
-    found, other = (
-        CandidateSearch(candidate("one"), candidate("one").start(), TRIAL_SIGMA) for _ in range(2)
-    )
-    for _ in range(generations):
-        asked = found.ask()
+def searched(rounds: int, beside: bool = False) -> PassSearch:
+    found, other = (PassSearch(kind("one"), TRIAL_SIGMA) for _ in range(2))
+    # Without the rows, which show all of this target.
+    found.add([trial_of(found.kind, each) for each in found.first(16)[-6:]])
+    for _ in range(rounds):
         if beside:
-            other.tell(other.ask(), [0.0] * GENERATION)
+            other.first(16)
             np.random.default_rng(0).normal(size=7)
-        found.tell(asked, [score(worth(found.candidate.values(each))) for each in asked])
+        found.add([trial_of(found.kind, each) for each in found.variations(10)])
     return found
 
 
-def test_the_search_finds_the_best_parameters():
-    found = evolved(40)
-    for name, best in BEST.items():
-        assert found.values[name] == pytest.approx(best, abs=0.01 * np.ptp(RANGES[name][:2]))
-    assert found.score == pytest.approx(score(replace(GOOD, seen=1.0)), abs=0.05)
-    assert found.candidate.values(found.best) == found.values and found.trials == 40 * GENERATION
+def test_variations_find_passes_that_show_all_of_the_target():
+    found = searched(30)
+    assert np.any([each.seen for each in found.best], axis=0).mean() > 0.99
+    # Four upright passes of 0.3 to each side are enough for a width of 2.
+    assert len(found.best) == 4 and found.score == score_of(found.best) > searched(0).score
+    assert len(found.tried) == 6 + 30 * 10
 
 
 def test_a_search_is_deterministic_and_independent_of_other_generators():
-    np.random.seed(5)  # noqa: NPY002 the one that all share
-    before = np.random.get_state()[1].copy()  # noqa: NPY002
-    alone = evolved(5)
-    assert np.array_equal(np.random.get_state()[1], before)  # noqa: NPY002
-    np.random.seed(6)  # noqa: NPY002
-    assert np.array_equal(evolved(5, beside=True).best, alone.best)
+    alone, beside = searched(5), searched(5, beside=True)
+    assert np.array_equal(
+        [each.parameters for each in alone.tried], [each.parameters for each in beside.tried]
+    )
 
 
-def test_the_first_generation_has_the_start_and_all_stay_in_range():
-    start = np.array([0.0, 1.0, 0.5])
-    found = CandidateSearch(candidate("one"), start, 0.5)
-    for generation in range(6):
-        asked = found.ask()
-        assert len(asked) == GENERATION and np.array_equal(asked[0], start) == (generation == 0)
-        assert all(((each >= 0) & (each <= 1)).all() for each in asked)
-        found.tell(asked, [each[0] for each in asked])
-    assert found.best[0] > 0.9 and found.score == found.best[0]
+def test_variations_are_of_the_best_passes_and_in_range():
+    found = PassSearch(kind("one"), TRIAL_SIGMA)
+    assert found.variations(8) == [] and found.score == -np.inf
+    found.add([trial_of(found.kind, each) for each in found.first(20)])
+    best = [each.parameters for each in found.best]
+    many = np.array(found.variations(200 * len(best)))
+    assert many.min() >= 0 and many.max() <= 1
+    for which, parameters in enumerate(best):
+        inner = (parameters > 0.2) & (parameters < 0.8)
+        for time, sigma in ((0, TRIAL_SIGMA), (1, TRIAL_SIGMA / 2)):
+            some = many[which :: len(best)][time::2][:, inner] - parameters[inner]
+            assert some.std() == pytest.approx(sigma, rel=0.15) and abs(some.mean()) < 0.2 * sigma
 
 
-@pytest.mark.parametrize("better", [True, False])
-def test_a_search_restarts_at_the_default_if_that_is_better(better):
-    """Than the optimum of the surrogate."""
-    one, start = candidate("one"), np.array([0.9, 0.9, 0.9])
-    found = CandidateSearch(one, start, TRIAL_SIGMA)
-    asked = found.ask()
-    assert np.array_equal(asked[:2], [start, one.start()])
-    found.tell(asked, [1.0, 2.0 if better else 0.0, *[0.5] * (GENERATION - 2)])
-    wanted = one.start() if better else start
-    away = np.linalg.norm(found.ask() - wanted, axis=1)
-    # Steps of TRIAL_SIGMA along each of three axes; what lies there is farther off.
-    assert away.max() < 5 * TRIAL_SIGMA < np.linalg.norm(start - one.start())
-    assert np.array_equal(found.best, wanted)
+def test_a_pass_that_cannot_be_held_is_not_one_of_the_tried():
+    found = PassSearch(kind("one"), TRIAL_SIGMA)
+    found.add([None, None])
+    assert found.tried == found.best == []
+    found.add([None, trial_of(found.kind, found.first(11)[0])])
+    assert len(found.tried) == len(found.best) == 1
 
 
-def test_part_of_a_generation_counts_and_the_best_so_far_stays():
-    found = CandidateSearch(candidate("one"), candidate("one").start(), TRIAL_SIGMA)
-    asked = found.ask()
-    found.tell(asked[:3], [1.0, 5.0, 2.0])
-    assert (found.trials, found.score) == (3, 5.0) and np.array_equal(found.best, asked[1])
-    found.tell(found.ask(), [4.0] * GENERATION)
-    assert (found.trials, found.score) == (3 + GENERATION, 5.0) and np.array_equal(found.best, asked[1])
-
-
-def test_the_surrogate_optimum_is_no_worse_than_the_default(monkeypatch):
-    asked: list[dict[str, float]] = []
+def test_the_surrogate_tries_rows_and_random_passes_and_varies_the_best(monkeypatch):
+    asked: list[np.ndarray] = []
 
     class Surrogate:
-        """Its path is the parameters."""
-
-        manipulator = None
-
         def __init__(self, trial) -> None: ...
 
-        def evaluate(self, values: dict[str, float]) -> ScoreTerms:
-            asked.append(values)
-            return worth(values)
+        def try_pass(self, kind: PassKind, parameters: np.ndarray) -> TriedPass | None:
+            asked.append(parameters)
+            return None if len(asked) % 5 == 0 else trial_of(kind, parameters)
 
     monkeypatch.setattr(plan_search, "RigidSurrogate", Surrogate)
-    monkeypatch.setattr(SweepCandidate, "path", lambda self, manipulator, values: values)
-    one = candidate("one")
-    best = surrogate_optimum(SimpleNamespace(rehearsal=SimpleNamespace(reset=lambda: None)), one)
-    assert len(asked) == -(-plan_search.SURROGATE_EVALUATIONS // GENERATION) * GENERATION
-    assert asked[0] == pytest.approx(one.values(one.start()))
-    assert worth(one.values(best)).seen == max(worth(values).seen for values in asked) > 0.99
+    one = kind("one")
+    best = surrogate_search(None, one)
+    assert len(asked) == plan_search.BEGINNING + plan_search.ROUNDS * plan_search.VARIATIONS
+    assert np.array_equal(asked[: len(one.rows())], one.rows())
+    tried = [trial_of(one, each) for number, each in enumerate(asked, 1) if number % 5]
+    assert score_of(best) == score_of(best_selection(tried))
+
+
+@pytest.mark.usefixtures("one_device")
+def test_passes_are_in_the_order_of_their_ends():
+    manipulator = manipulator_on(big_ball())
+    rehearsal = SimpleNamespace(manipulator=manipulator)
+    one = kind("one")
+    values = dict.fromkeys(RANGES["slide"], 0.0) | dict(start=-1.0, end=1.0)
+    aside = [one.scaled(values | dict(aside=at)) for at in (-1.0, 1.0, 0.0)]
+    backwards = [one.scaled(values | dict(aside=0.5, start=1.0, end=-1.0))]
+    ordered = plan_search._in_order(SimpleNamespace(rehearsal=rehearsal), one, aside + backwards)
+    # From -10 mm to the end of the one that runs back at 5 mm, then from where that ends to the nearest.
+    assert [round(float(each[0, 0, 3])) for each in ordered] == [-10, 5, 0, 10]
 
 
 # Distribution of trials
 
 
-@pytest.mark.parametrize("trials", [4, 5, 37, 64, 96, 101])
+@pytest.mark.parametrize("trials", [2, 5, 37, 64])
 def test_all_trials_are_made_and_counted(trials):
-    workers, done = Counting(four()), []
-    searches = search(workers.candidates, workers, trials, done.append)
-    made = Counter(each.side for each, _, _ in workers.tasks)
-    assert sum(made.values()) == len(workers.tasks) == trials and Counter(done) == {
-        1: trials,
-        SURROGATE_TRIALS: 4,
-    }
-    assert {one.candidate.side: one.trials for one in searches} == made
-    assert {speed for _, _, speed in workers.tasks} == {TRIAL_MM_S} and workers.surrogate_optima == 4
+    workers, done = three(), []
+    searches = search(workers.kinds, workers, trials, done.append)
+    assert len(workers.passes) == trials == sum(len(one.tried) for one in searches)
+    assert done == [SURROGATE_TRIALS] * 3 + [1] * trials
 
 
-def test_the_better_half_has_the_rest():
-    workers = Counting(four())
-    searches = search(workers.candidates, workers, 96, lambda _: None)
-    trials = {one.candidate.side: one.trials for one in searches}
-    half = (96 - 2 * GENERATION) // 2
-    assert trials == {"sweep 0": GENERATION, "sweep 2": GENERATION, "sweep 1": half, "sweep 3": half}
-    of_three = search(four()[:3], Counting(four()[:3]), 96, lambda _: None)
-    assert sum(one.trials == max(each.trials for each in of_three) for one in of_three) == 2
+def test_the_best_two_on_the_surrogate_are_tried_and_the_better_one_has_the_rest():
+    workers = three()
+    searches = search(workers.kinds, workers, 60, lambda _: None)
+    assert [one.kind.side for one in searches] == ["side 1", "side 2"] and MOST_SWEEPS == 2
+    begun = {side: len(workers.on_surrogate(kind(side))) for side in ("side 1", "side 2")}
+    assert len(searches[1].tried) == begun["side 2"] and len(searches[0].tried) == 60 - begun["side 2"]
+    # Rounds of trials, each of variations of the best so far.
+    first = workers.passes[sum(begun.values()) :][:ROUND_TRIALS]
+    assert {side for side, _ in first} == {"side 1"}
 
 
-def test_every_answer_goes_to_the_candidate_that_asked():
-    workers = Counting(four())
-    for one in search(workers.candidates, workers, 45, lambda _: None):
-        tried = [values for each, values, _ in workers.tasks if each is one.candidate]
-        scores = [score(worth(values, one.candidate.count / 100)) for values in tried]
-        assert one.score == max(scores) and one.values == tried[int(np.argmax(scores))]
-        assert tried[0] == pytest.approx(one.candidate.values(one.candidate.start()))
+def test_every_answer_goes_to_the_search_that_asked():
+    workers = three()
+    for one in search(workers.kinds, workers, 45, lambda _: None):
+        asked = [parameters for side, parameters in workers.passes if side == one.kind.side]
+        assert np.array_equal([each.parameters for each in one.tried], asked)
+        wanted = [trial_of(one.kind, each, workers.handicaps[one.kind.side]).seen for each in asked]
+        assert np.array_equal([each.seen for each in one.tried], wanted)
 
 
-def test_two_searches_try_the_same():
-    one, two = Counting(four()), Counting(four())
-    for workers in (one, two):
-        search(workers.candidates, workers, 70, lambda _: None)
-    assert [(each.side, values) for each, values, _ in one.tasks] == [
-        (each.side, values) for each, values, _ in two.tasks
-    ]
-
-
-def test_the_best_of_each_is_tried_once_more_and_ranked():
-    workers, done = Counting(four()), []
-    searches = search(workers.candidates, workers, 48, lambda _: None)
-    workers.tasks.clear()
-    rows = ranked(searches, workers, 12.0, done.append)
-    assert [one.candidate.side for one, _, _ in rows] == ["sweep 1", "sweep 3", "sweep 2", "sweep 0"]
-    assert done == [3] * 4 and {speed for _, _, speed in workers.tasks} == {12.0}
-    assert all(terms == worth(one.values, one.candidate.count / 100) for one, terms, _ in rows)
-    # A candidate without trials has no parameters to try.
-    untried = CandidateSearch(candidate("untried"), np.zeros(3), TRIAL_SIGMA)
-    assert len(ranked([*searches, untried], workers, 12.0, lambda _: None)) == 4
+def test_the_best_sets_are_tried_as_sweeps_and_ranked():
+    workers, done = three(), []
+    searches = search(workers.kinds, workers, 30, lambda _: None)
+    rows = ranked(searches[::-1], workers, 12.0, done.append)
+    assert [one.kind.side for one, _, _ in rows] == ["side 1", "side 2"]
+    assert done == [plan_search.work_at(12.0)] * 2 and {speed for _, _, speed in workers.sweeps} == {12.0}
+    for one, _, passes in rows:
+        (parameters,) = [asked for side, asked, _ in workers.sweeps if side == one.kind.side]
+        assert np.array_equal(parameters, [each.parameters for each in one.best])
+        assert len(passes) == len(one.best)
 
 
 # A plan made
@@ -251,17 +240,15 @@ def test_the_best_of_each_is_tried_once_more_and_ranked():
 def test_a_plan_contains_the_ranked_sweeps(tmp_path):
     problem, done, plans = problem_of(trocar=Trocar(cone_deg=33)), [], []
     for _ in range(2):
-        workers = Counting(four())
+        workers = three()
         workers.problem = problem
-        plans.append(make_plan(workers, 12.0, 96, done.append))
-    assert sum(done) == 2 * total_work(96, 12.0), "what the command's progress bar expects"
+        plans.append(make_plan(workers, 12.0, 40, done.append))
+    assert sum(done) == 2 * total_work(40, 12.0), "what the command's progress bar expects"
     assert done[0] == 0 and done.count(0) == 2
     plan = plans[0]
-    assert [each.name.split("passes ")[-1].removeprefix("one pass ") for each in plan.sweeps] == [
-        *("sweep 1", "sweep 3", "sweep 2", "sweep 0")
-    ]
+    assert [each.name[-6:] for each in plan.sweeps] == ["side 1", "side 2"]
     scores = [each.score for each in plan.sweeps]
-    assert scores == sorted(scores, reverse=True) and sum(each.trials for each in plan.sweeps) == 96
+    assert scores == sorted(scores, reverse=True) and sum(each.trials for each in plan.sweeps) == 40
     for each in plan.sweeps:
         assert each.score == pytest.approx(sum(each.points.values()), abs=1e-5)
         assert each.score == pytest.approx(score(ScoreTerms(**each.parts)), abs=1e-3)
@@ -269,22 +256,20 @@ def test_a_plan_contains_the_ranked_sweeps(tmp_path):
     assert plan.anatomy == fingerprint(problem.anatomy) and plan.trocar.cone_deg == 33
     assert (plan.target, plan.margin_mm, plan.speed_mm_s) == ("organ", 5.0, 12.0)
     named = [
-        re.match(r"(The first sweep is|It comes before) .*sweep (\d), with -?[\d.]+ points: it .*\.$", line)
+        re.match(r"(The first sweep is|It comes before) .*side (\d), with -?[\d.]+ points: it .*\.$", line)
         for line in plan.why
     ]
-    assert [one[2] for one in named] == ["1", "3", "2", "0"]
+    assert [one[2] for one in named] == ["1", "2"]
     for name, each in zip("ab", plans, strict=True):
         write_plan(each, tmp_path / name)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
     assert read_plan(tmp_path / "a") == plan
 
 
-@pytest.mark.parametrize(
-    "workers", [Counting(four(), reachable=0.95), Counting(four(), ways=0), Counting([])]
-)
+@pytest.mark.parametrize("workers", [three(reachable=False), Counting({})])
 def test_without_a_reachable_sweep_there_is_an_error(workers):
     with pytest.raises(PlanError, match="no sweep was found.*move the trocar, widen its cone") as error:
-        make_plan(workers, 10.0, 4 if workers.candidates else 0, lambda _: None)
+        make_plan(workers, 10.0, 4, lambda _: None)
     assert "\n" not in str(error.value)
 
 
@@ -294,7 +279,7 @@ def test_a_comparison_reports_its_progress_and_averages_the_random_sweeps(monkey
 
     class Crew(Counting):
         def __init__(self, problem: PlanningProblem, workers: object) -> None:
-            super().__init__(four())
+            super().__init__({"side 0": 0.1, "side 1": 0.0, "side 2": 0.05})
             shared.append(workers)
 
     monkeypatch.setattr(plan_comparison, "TrialWorkers", Crew)

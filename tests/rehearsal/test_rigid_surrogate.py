@@ -11,7 +11,7 @@ from plan_ball import SIZE, R, X, Y, Z, big_ball, manipulator_on
 from rehearsal.planning import rigid_surrogate
 from rehearsal.planning.rigid_surrogate import RigidSurrogate
 from rehearsal.planning.sweep_path import tilted
-from rehearsal.planning.sweep_score import ScoreTerms
+from rehearsal.planning.sweep_score import MEANS
 from rehearsal.planning.sweep_trial import Trial
 from sim.fields import field_of
 from ultrasound.coverage import VOXEL_MM, Coverage
@@ -46,20 +46,28 @@ def surrogate_of(monkeypatch, probe) -> tuple[RigidSurrogate, Coverage]:
     held = SimpleNamespace(
         manipulator=manipulator_on(big_ball(), size), model=None, probe=probe, scene=scene, size_mm=size
     )
+    held.reset = lambda: None
     trial = SimpleNamespace(
-        rehearsal=held, places=coverage.voxel_centres("tumour"), reach=lambda poses: poses[:, 0, 3] < 5.0
+        rehearsal=held,
+        sampled_places=coverage.voxel_centres("tumour"),
+        reach=lambda poses: poses[:, 0, 3] < 100.0,
     )
-    trial.terms = partial(Trial.terms, trial)
+    trial.terms, trial.tried = partial(Trial.terms, trial), partial(Trial.tried, trial)
     return RigidSurrogate(trial), coverage
 
 
-def path_over_the_tumour(length: float) -> list[np.ndarray]:
+def path_over_the_tumour(length: float) -> np.ndarray:
     """Poses whose faces are 1, 3 and 0.5 mm in the ball, the second tilted and the third turned; one above it, and one beside it."""
     faces = np.array([[0, 0, R - 1], [0, -4, R - 3], [3, 0, R - 0.5], [0, 5, R + 3]])
     down = np.stack([pose_at(face, -Z, X, length) for face in faces])
     down[1] = tilted(down[1], length, 12.0)
     down[2] = pose_at(faces[2], -Z, X + Y, length)
-    return [down, pose_at(R * Z + 60 * X, -Z, X, length)[None]]
+    return np.concatenate([down, pose_at(R * Z + 60 * X, -Z, X, length)[None]])
+
+
+def kind_with(poses: np.ndarray | None) -> SimpleNamespace:
+    """A kind of pass whose only pass this is."""
+    return SimpleNamespace(values=lambda parameters: {}, poses=lambda manipulator, values: poses)
 
 
 @pytest.mark.parametrize("name", ["linear", "drop-in", "curvilinear"])
@@ -67,26 +75,27 @@ def test_the_surrogate_agrees_with_counting_voxels_one_by_one(monkeypatch, name)
     probe = load_probe(name)
     found, coverage = surrogate_of(monkeypatch, probe)
     length = float(probe.housing_mm[2])
-    path = path_over_the_tumour(length)
-    poses = np.concatenate(path)
-    terms = found.evaluate(path)
+    poses = path_over_the_tumour(length)
+    tried = found.try_pass(kind_with(poses), np.arange(3.0))
+    terms = SimpleNamespace(**dict(zip(MEANS, tried.sums / 5, strict=True)))
+    assert tried.poses == 5 and np.array_equal(tried.parameters, np.arange(3.0))
     places = coverage.origin_mm + VOXEL_MM * np.argwhere(coverage.targets["tumour"])
     surely, perhaps = np.zeros(len(places), bool), np.zeros(len(places), bool)
     for pose in poses:
         slack = [shown_by(probe, pose, length, places, off) for off in (-0.3, 0.3)]
         surely |= slack[0]
         perhaps |= slack[1]
-    assert surely.mean() <= terms.seen <= perhaps.mean() and 0.2 < terms.seen < 0.99
+    assert (surely <= tried.seen).all() and (tried.seen <= perhaps).all() and 0.2 < tried.seen.mean() < 0.99
     assert perhaps.mean() - surely.mean() < 0.12
     deep = [max(depth_of_array(probe, pose, length).max(), 0.0) for pose in poses]
     # Distances between voxels are off by VOXEL^2 / 8 of the curvatures 2 / R, and the facets.
     off = VOXEL_MM**2 / 4 / R + 0.05
-    assert terms.compression_max_mm == pytest.approx(max(deep), abs=off)
     assert terms.compression_mean_mm == pytest.approx(np.mean(deep), abs=off)
-    assert terms.over_limit == np.mean(np.array(deep) > WARNING_MM) == 0.2
+    assert terms.over_limit == pytest.approx(np.mean(np.array(deep) > WARNING_MM)) == 0.2
     touching = [(depth_of_array(probe, pose, length) >= -GAP_MM).mean() for pose in poses]
     assert terms.contact == pytest.approx(np.mean(touching), abs=1.5 / rigid_surrogate.ELEMENTS)
-    assert terms.reachable == 0.8 and terms.time_s == 0.0
+    faces = (poses @ [0.0, 0.0, -length / 2, 1.0])[:, :3]
+    assert tried.path_mm == pytest.approx(np.linalg.norm(np.diff(faces, axis=0), axis=1).sum())
 
 
 def shown_by(probe, pose: np.ndarray, length: float, places: np.ndarray, slack: float) -> np.ndarray:
@@ -120,10 +129,14 @@ def depth_of_array(probe, pose: np.ndarray, length: float) -> np.ndarray:
     return R - np.linalg.norm(np.array(at)[:, :3], axis=1)
 
 
-def test_the_surrogate_of_no_pass_is_nothing_and_of_the_same_way_the_same(monkeypatch):
+def test_a_pass_that_cannot_be_held_is_not_tried_and_the_same_pass_gives_the_same(monkeypatch):
     found, _ = surrogate_of(monkeypatch, load_probe("linear"))
-    assert found.evaluate([]) == ScoreTerms()
-    path = path_over_the_tumour(SIZE[2])
-    assert found.evaluate(path) == found.evaluate(path)
-    # It makes paths with fewer samples, and does not change the manipulator of the trials.
+    poses = path_over_the_tumour(SIZE[2])
+    one, again = (found.try_pass(kind_with(poses), np.zeros(0)) for _ in range(2))
+    assert np.array_equal(one.seen, again.seen) and np.array_equal(one.sums, again.sums)
+    out_of_reach = poses.copy()
+    out_of_reach[-1, 0, 3] = 101.0
+    for beside in (None, out_of_reach):
+        assert found.try_pass(kind_with(beside), np.zeros(0)) is None
+    # It makes passes with fewer samples, and does not change the manipulator of the trials.
     assert len(found.manipulator.samples) < len(found.trial.rehearsal.manipulator.samples)

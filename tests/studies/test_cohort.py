@@ -54,7 +54,8 @@ def run(folders: list[Path], out: Path, *options: str) -> int:
 def test_patients_are_settled_pressed_and_planned_for_on_a_cluster(
     patients, tmp_path, cluster, monkeypatch, capsys
 ):
-    monkeypatch.setattr(plan_search, "SURROGATE_EVALUATIONS", 8)
+    for name, few in dict(BEGINNING=24, ROUNDS=1, VARIATIONS=4).items():
+        monkeypatch.setattr(plan_search, name, few)
     monkeypatch.setattr(patient_run, "SPEED_MM_S", 60.0)
     out = tmp_path / "out"
     assert run(patients, out, "--dask", cluster) == 0

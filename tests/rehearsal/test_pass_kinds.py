@@ -1,5 +1,6 @@
-"""The candidates of a plan, and unplanned sweeps, over a ball with a tumour."""
+"""The kinds of pass of a plan, and unplanned sweeps, over a ball with a tumour."""
 
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -21,13 +22,13 @@ from plan_ball import (
 )
 
 from rehearsal.coordinates import probe_in_patient
-from rehearsal.planning.plan_file import MOST_SWEEPS
-from rehearsal.planning.sweep_candidates import (
+from rehearsal.planning.pass_kinds import (
     LEAST_COSINE,
     MOST_PASSES,
-    SweepCandidate,
-    candidates_of,
+    RANGES,
+    PassKind,
     directions,
+    kinds_of,
     nearest_side,
     target_from,
 )
@@ -67,8 +68,8 @@ def aside_by(degrees: float) -> np.ndarray:
     return np.array([0.0, np.sin(np.radians(degrees)), np.cos(np.radians(degrees))])
 
 
-def found_for(rehearsal, at: np.ndarray, reach=everywhere, radius: float = 7.0) -> list[SweepCandidate]:
-    return candidates_of(trial_of(rehearsal, coverage_of(at, radius).voxel_centres("tumour"), reach))
+def found_for(rehearsal, at: np.ndarray, reach=everywhere, radius: float = 7.0) -> list[PassKind]:
+    return kinds_of(trial_of(rehearsal, coverage_of(at, radius).voxel_centres("tumour"), reach))
 
 
 def trial_of(rehearsal, places: np.ndarray, reach=everywhere) -> SimpleNamespace:
@@ -89,21 +90,19 @@ def test_directions_are_units_evenly_around():
     assert found.T @ found / 300 == pytest.approx(np.eye(3) / 3, abs=0.01)
 
 
-def test_a_tumour_on_top_has_candidates_from_above_only(rehearsal):
+def test_a_tumour_on_top_has_passes_from_above_only(rehearsal):
     found = found_for(rehearsal, 18.0 * Z)
-    assert [each.motion for each in found] == ["slide", "slide", "tilt"]
+    assert [each.motion for each in found] == ["slide", "tilt"]
     assert all(each.side == "from above" for each in found)
-    assert [each.count for each in found] == [1, 2, 1]
     for each in found:
         assert each.frame[:3, 2] == pytest.approx(Z) and each.frame[:3, 0] == pytest.approx(X)
         assert each.frame[:3, 3] == pytest.approx(18.0 * Z, abs=VOXEL_MM / 2)
 
 
 @pytest.mark.parametrize("aside", [40.0, -60.0])
-def test_a_tumour_at_the_side_has_candidates_from_there_too(rehearsal, aside):
+def test_a_tumour_at_the_side_has_passes_from_there_too(rehearsal, aside):
     found = found_for(rehearsal, 18.0 * aside_by(aside))
-    assert [each.motion for each in found] == ["slide", "slide", "slide", "tilt"]
-    assert len(found) <= MOST_SWEEPS
+    assert [each.motion for each in found] == ["slide", "slide", "tilt"]
     assert found[0].frame[:3, 2] == pytest.approx(Z)
     for each in found[1:]:
         assert angle_deg(each.frame[:3, 2], aside_by(aside)) < GRAIN_DEG
@@ -126,7 +125,7 @@ def test_the_nearest_side_is_one_that_can_be_reached(rehearsal):
     assert outward[1] < -0.1
     assert nearest_side(trial_of(rehearsal, centre[None], lambda poses: ~everywhere(poses))) is None
     nowhere = found_for(rehearsal, centre, lambda poses: ~everywhere(poses))
-    assert len(nowhere) == 3 and all(each.side == "from above" for each in nowhere)
+    assert len(nowhere) == 2 and all(each.side == "from above" for each in nowhere)
 
 
 def test_half_of_a_target_is_measured_across_and_along(rehearsal):
@@ -146,76 +145,100 @@ def test_passes_are_as_many_as_the_target_is_wide_in_pictures(rehearsal):
     assert sorted(counts) == counts and counts[-1] == MOST_PASSES and set(np.diff(counts)) == {0, 1}
 
 
-def test_no_two_candidates_are_the_same_where_passes_are_at_their_most(rehearsal):
-    narrow = SimpleNamespace(
-        **vars(rehearsal) | dict(probe=load_probe("linear").model_copy(update=dict(transducer_width_mm=3.0)))
-    )
-    found = candidates_of(trial_of(narrow, coverage_of(18.0 * Z).voxel_centres("organ")))
-    assert {each.count for each in found} == {MOST_PASSES}
-    assert len({each.name(each.count) for each in found}) == len(found) == 3
+@pytest.mark.parametrize("motion", ["slide", "tilt"])
+def test_parameters_go_from_end_to_end_of_their_ranges(rehearsal, motion):
+    kind = kind_of(rehearsal, motion)
+    low, high = (kind.values(np.full(len(RANGES[motion]), end)) for end in (-3.0, 7.0))
+    for name, (least, greatest, *first) in RANGES[motion].items():
+        assert (low[name], high[name]) == (least, greatest)
+        assert least <= first[0] < first[1] <= greatest
+    values = {name: 0.3 * low[name] + 0.7 * high[name] for name in low}
+    assert kind.values(kind.scaled(values)) == pytest.approx(values)
 
 
-@pytest.mark.parametrize("radius", [7.0, 12.0])
-def test_each_begins_over_its_target_and_its_numbers_go_from_end_to_end(rehearsal, radius):
-    for each in found_for(rehearsal, 15.0 * aside_by(35), radius=radius):
-        start = each.start()
-        assert ((start >= 0) & (start <= 1)).all()
-        values = each.values(start)
-        assert list(values) == list(each.ranges)
-        for (name, value), (low, high, begins) in zip(values.items(), each.ranges.values(), strict=True):
-            assert low < high and low <= begins <= high and value == pytest.approx(begins), name
-        beyond = each.values(np.where(np.arange(len(start)) % 2, -3.0, 7.0))
-        ends = [low if n % 2 else high for n, (low, high, _) in enumerate(each.ranges.values())]
-        assert list(beyond.values()) == ends
-        passes = each.path(rehearsal.manipulator, values)
-        assert len(passes) == each.count
-        faces = np.concatenate([faces_in(each) for each in passes])
-        over = np.linalg.norm(np.cross(faces - each.frame[:3, 3], each.frame[:3, 2]), axis=1)
-        assert over.min() < WIDTH and over.max() < 3 * radius
+@pytest.mark.parametrize("motion", ["slide", "tilt"])
+def test_a_search_begins_with_passes_over_the_target(rehearsal, motion):
+    kind = kind_of(rehearsal, motion)
+    random = kind.random(np.random.default_rng(3), 40)
+    ends = ("start", "end") if motion == "slide" else ("first_deg", "last_deg")
+    backwards = 0
+    for parameters in random:
+        values = kind.values(parameters)
+        assert kind.values(kind.scaled(values)) == pytest.approx(values)
+        first, last = sorted(values[name] for name in ends)
+        assert RANGES[motion][ends[0]][2] <= first and last <= RANGES[motion][ends[1]][3]
+        backwards += values[ends[0]] > values[ends[1]]
+    assert backwards == 20
+    assert np.array_equal(random, kind.random(np.random.default_rng(3), 40))
+    for parameters in [*kind.rows(), *random]:
+        poses = kind.poses(rehearsal.manipulator, kind.values(parameters))
+        over = np.linalg.norm(np.cross(faces_in(poses) - kind.frame[:3, 3], kind.frame[:3, 2]), axis=1)
+        assert over.max() < 3 * RADIUS
 
 
-def test_sliding_starts_as_straight_rows(rehearsal):
-    trial = trial_of(rehearsal, coverage_of(16.0 * Z, 12.0).voxel_centres("tumour"))
-    slide = next(each for each in candidates_of(trial) if each.count > 1)
-    rows = row_by_row(trial)
-    begun = slide.path(rehearsal.manipulator, slide.values(slide.start()))
-    assert slide.motion == "slide" and len(rows) == slide.count
-    assert np.concatenate(begun) == pytest.approx(np.concatenate(rows), abs=1e-9)
+def test_rows_lie_side_by_side_over_the_whole_target(rehearsal):
+    kind = kind_of(rehearsal, "slide")
+    rows = [kind.values(each) for each in kind.rows()]
+    assert [each["heading_deg"] for each in rows] == pytest.approx([0.0] * 5 + [90.0] * 5)
+    assert all(each["lean_deg"] == each["lean_aside_deg"] == each["follow"] == 0.0 for each in rows)
+    # As many as needed, and one more; they share the target.
+    two, three = ([each["aside"] * RADIUS for each in part] for part in (rows[:2], rows[2:5]))
+    assert np.diff(two) == pytest.approx(RADIUS, rel=0.1) and np.mean(two) == pytest.approx(0, abs=1e-9)
+    assert np.diff(three) == pytest.approx(2 * RADIUS / 3, rel=0.1) and three[1] == pytest.approx(0, abs=1e-9)
+    narrow = replace(kind, width_mm=0.1)
+    assert len(narrow.rows()) == 2 * (2 * MOST_PASSES + 1)
 
 
-def sliding_candidate(rehearsal, count: int) -> SweepCandidate:
-    found = found_for(rehearsal, 18.0 * Z, radius=9.0)
-    return next(each for each in found if each.motion == "slide" and each.count == count)
+RADIUS = 12.0
 
 
-def values_of(candidate: SweepCandidate, **changes: float) -> dict[str, float]:
-    values = candidate.values(candidate.start())
+def kind_of(rehearsal, motion: str) -> PassKind:
+    found = found_for(rehearsal, 16.0 * Z, radius=RADIUS)
+    return next(each for each in found if each.motion == motion)
+
+
+def values_of(kind: PassKind, **changes: float) -> dict[str, float]:
+    values = dict.fromkeys(RANGES[kind.motion], 0.0)
     assert changes.keys() <= values.keys()
-    return values | dict(follow=0.0) | changes
+    return values | changes
 
 
 def test_sliding_follows_its_parameters(rehearsal):
-    slide, manipulator = sliding_candidate(rehearsal, 2), rehearsal.manipulator
-    numbers = values_of(slide, aside_mm=2.0, apart_mm=9.0, start_mm=-7.0, end_mm=5.0, depth_mm=0.0)
-    one, two = (faces_in(each) - slide.frame[:3, 3] for each in slide.path(manipulator, numbers))
-    assert one[:, 0] == pytest.approx(2.0 - 4.5) and two[:, 0] == pytest.approx(2.0 + 4.5)
-    assert one[[0, -1], 1] == pytest.approx([-7, 5]) and two[[0, -1], 1] == pytest.approx([5, -7])
-    deeper = slide.path(manipulator, numbers | dict(depth_mm=3.0))[0]
+    slide, manipulator = kind_of(rehearsal, "slide"), rehearsal.manipulator
+    across, along = slide.half_mm
+    numbers = values_of(slide, aside=0.25, start=-0.6, end=0.5)
+    one = faces_in(slide.poses(manipulator, numbers)) - slide.frame[:3, 3]
+    assert one[:, 0] == pytest.approx(0.25 * across)
+    assert one[[0, -1], 1] == pytest.approx([-0.6 * along, 0.5 * along])
+    back = faces_in(slide.poses(manipulator, numbers | dict(start=0.5, end=-0.6))) - slide.frame[:3, 3]
+    assert back == pytest.approx(one[::-1])
+    deeper = slide.poses(manipulator, numbers | dict(depth_mm=3.0))
     assert faces_in(deeper) - slide.frame[:3, 3] == pytest.approx(one - 3.0 * Z)
-    turned = faces_in(slide.path(manipulator, numbers | dict(heading_deg=90.0))[0]) - slide.frame[:3, 3]
-    assert turned[[0, -1], 0] == pytest.approx([7, -5]) and turned[:, 1] == pytest.approx(-2.5)
+    turned = faces_in(slide.poses(manipulator, numbers | dict(heading_deg=90.0))) - slide.frame[:3, 3]
+    assert turned[[0, -1], 0] == pytest.approx([0.6 * across, -0.5 * across])
+    assert turned[:, 1] == pytest.approx(0.25 * along)
     for name, axis in (("lean_deg", [0, -0.5, np.sqrt(0.75)]), ("lean_aside_deg", [0.5, 0, np.sqrt(0.75)])):
-        leant = np.concatenate(slide.path(manipulator, numbers | {name: 30.0}))
+        leant = slide.poses(manipulator, numbers | {name: 30.0})
         assert leant[:, :3, 2] == pytest.approx(np.tile(axis, (len(leant), 1)))
+    beside = replace(slide, half_mm=np.array([100.0, 100.0]))
+    assert beside.poses(manipulator, numbers | dict(aside=1.0)) is None
+
+
+def test_half_of_the_extent_across_and_along_depends_on_the_heading(rehearsal):
+    slide = replace(kind_of(rehearsal, "slide"), half_mm=np.array([7.0, 3.0]))
+    assert slide.extent_mm(0.0) == pytest.approx((7, 3)) and slide.extent_mm(-90.0) == pytest.approx((3, 7))
+    assert slide.extent_mm(45.0) == pytest.approx((10 / np.sqrt(2), 10 / np.sqrt(2)))
 
 
 def test_tilting_follows_its_parameters(rehearsal):
-    tilt = next(each for each in found_for(rehearsal, 18.0 * Z) if each.motion == "tilt")
-    numbers = values_of(tilt, ahead_mm=0.0, first_deg=-10.0, last_deg=24.0, depth_mm=1.0)
-    (poses,) = tilt.path(rehearsal.manipulator, numbers)
+    tilt = kind_of(rehearsal, "tilt")
+    numbers = values_of(tilt, first_deg=-10.0, last_deg=24.0, depth_mm=1.0)
+    poses = tilt.poses(rehearsal.manipulator, numbers)
     angles = np.degrees(np.arctan2(-poses[:, 1, 2], poses[:, 2, 2]))
     assert angles[[0, -1]] == pytest.approx([-10, 24], abs=1.5)
     assert faces_in(poses)[:, 2] == pytest.approx(R - 1.0, abs=FACET_MM)
+    ahead = tilt.poses(rehearsal.manipulator, numbers | dict(ahead=0.5))
+    assert faces_in(ahead)[0, 1] - faces_in(poses)[0, 1] == pytest.approx(0.5 * tilt.half_mm[1], abs=1.0)
 
 
 # Unplanned sweeps
@@ -248,9 +271,9 @@ def test_random_sweeps_depend_on_the_seed_and_are_over_the_target(trial):
 
 
 def test_the_poses_of_a_plan_are_those_of_the_path_in_the_patient(rehearsal):
-    path = sliding_candidate(rehearsal, 2).path(
-        rehearsal.manipulator, values_of(sliding_candidate(rehearsal, 2))
-    )
+    slide = kind_of(rehearsal, "slide")
+    sides = [values_of(slide, start=-1.0, end=1.0, aside=aside) for aside in (-0.5, 0.5)]
+    path = [slide.poses(rehearsal.manipulator, values) for values in sides]
     poses = np.concatenate(path)
     placed = np.stack([probe_in_patient(rehearsal, pose) for pose in poses])
     # PLUS's axes of a probe: x to the marked side, y into the tissue, from the middle of the face.
