@@ -149,8 +149,8 @@ def make_plan(workers: Trials, speed_mm_s: float, trials: int, progress: Progres
     rows = [row for row in ranked(searches, workers, speed_mm_s, progress) if row[2]]
     if not rows or rows[0][1].reachable < 1.0:
         raise PlanError(
-            "no sweep was found that an instrument through the trocar can hold at all poses; move the trocar, widen its cone, "
-            "or give the search more --trials"
+            "no sweep was found that an instrument through the trocar can hold at all poses, and that starts outside the organ; move the "
+            "trocar, widen its cone, or give the search more --trials"
         )
     sweeps = [
         PlannedSweep(
