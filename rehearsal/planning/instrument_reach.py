@@ -37,7 +37,7 @@ def clear_of_organ(manipulator: ProbeManipulator, poses: np.ndarray) -> np.ndarr
     half = manipulator.size_mm / 2
     return np.array(
         [
-            not (np.abs((manipulator.vertices - at[:3, 3]) @ at[:3, :3]) < half).all(axis=1).any()
+            not (np.abs((manipulator.samples - at[:3, 3]) @ at[:3, :3]) < half).all(axis=1).any()
             for at in poses
         ]
     )
