@@ -69,9 +69,10 @@ def tumour_anatomy(
     axes = kidney_axes(organ, [tumour, *cysts], parts, hilum_mm)
     points = points_inside(largest)
     heights = axes.heights(largest.vertices)
-    vessels = vessels_of(labels, tissues or {})
+    labelled = vessels_of(labels, tissues or {})
+    vessels = {kind: vessel for kind, vessel in labelled.items() if reaches_kidney(vessel, axes.contour)}
     # Arteries and veins share one surface: it serves where no voxels tell them apart.
-    wanted = ("urine", "sinus") if vessels else ("urine", "sinus", "vessel")
+    wanted = ("urine", "sinus") if labelled else ("urine", "sinus", "vessel")
     surfaces = {tissue: parts[tissue] for tissue in wanted if tissue in parts}
     return TumourAnatomy(
         tumours=len(bodies),
@@ -130,6 +131,11 @@ def vessels_of(labels: Grid | None, tissues: dict[int, str]) -> dict[str, Grid]:
     codes = {kind: [code for code, tissue in tissues.items() if tissue == kind] for kind in MAIN_DIAMETER_MM}
     masks = {kind: np.isin(labels.voxels, found) for kind, found in codes.items() if found}
     return {kind: Grid(mask, labels.index_from_mm) for kind, mask in masks.items() if mask.any()}
+
+
+def reaches_kidney(vessel: Grid, contour: trimesh.Trimesh) -> bool:
+    """Whether a labelled vessel is the kidney's own, which ends in its contour; aorta and vena cava do not."""
+    return bool(_inside(contour, _places(vessel, np.argwhere(vessel.voxels))).any())
 
 
 def voxel_distance_mm(tumour: trimesh.Trimesh, vessel: Grid) -> float:

@@ -33,8 +33,8 @@ class Embedding:
     """Tetrahedra of a regular grid around a closed surface, whose vertices move with the tissue model.
 
     ``tetrahedron`` (m,): four vertex indices each, of a rest mesh without gaps (Kuhn's six tetrahedra per cell). Outside the
-    body the displacement of the vertices falls to zero at ``margin_mm``, so that the surroundings deform without gaps;
-    ``share`` (n,) is the factor of each vertex.
+    body they move with the nearest point of its surface, but less with the distance and not at all at ``margin_mm``, so that the
+    surroundings deform without gaps; ``share`` (n,) is the factor of each vertex.
 
     ``rest_from_plane`` (m + 1,) maps (u, v, w) of an image plane [mm] to rest positions, for each tetrahedron that
     ``locate_on_plane`` found on it; the last is for points in no tetrahedron, which do not move.
@@ -43,8 +43,8 @@ class Embedding:
     def __init__(
         self, model: TissueModel, surface: trimesh.Trimesh, cell_mm: float, margin_mm: float = 0.0
     ) -> None:
-        vertices, tetrahedra, share = stored(_embedding_mesh, surface, cell_mm, margin_mm)
-        self.skin = Skin(model, vertices)
+        vertices, tetrahedra, share, at = stored(_embedding_mesh, surface, cell_mm, margin_mm)
+        self.skin = Skin(model, vertices, at)
         self.share = field_of(share)
         self.count = len(tetrahedra)
         self.serial = is_too_small(self.count, PARALLEL_FROM)
@@ -192,17 +192,21 @@ class Unmoved:
 
 def _embedding_mesh(
     surface: trimesh.Trimesh, cell_mm: float, margin_mm: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (v, 3) [mm], tetrahedra (t, 4) in their order, and each vertex's share (v,)."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices (v, 3) [mm], tetrahedra (t, 4) in their order, each vertex's share (v,), and the tissue (v, 3) that it moves with."""
     vertices, tetrahedra = tetrahedra_around(surface, cell_mm, margin_mm)
     # A tetrahedron that contains tissue extends this far outside: all of its vertices must move with the tissue.
     extent = np.sqrt(3) * cell_mm
-    outside = np.maximum(signed_distance(surface.vertices, surface.faces, vertices)[0], 0.0)
+    distance, face = signed_distance(surface.vertices, surface.faces, vertices)
+    outside = np.maximum(distance, 0.0)
+    # Extrapolated along their gradient at the surface, displacements would fold the surroundings where a probe presses.
+    on_surface = trimesh.triangles.closest_point(surface.triangles[face], vertices)
+    at = np.where(outside[:, None] > 0, on_surface, vertices)
     beyond = np.maximum(outside - extent, 0.0)
     # Where tetrahedra overlap after deformation, the lowest index is taken: those in or nearest to the organ come first.
     layer = np.ceil(outside[tetrahedra].min(axis=1) / cell_mm)
     share = np.clip(1.0 - beyond / max(margin_mm - extent, cell_mm), 0.0, 1.0)
-    return vertices, tetrahedra[np.argsort(layer, kind="stable")], share
+    return vertices, tetrahedra[np.argsort(layer, kind="stable")], share, at
 
 
 def tetrahedra_around(

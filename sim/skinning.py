@@ -11,20 +11,22 @@ from sim.tissue_model import TissueModel
 class Skin:
     """Points (n, 3) [mm] attached to a tissue model's frames (the paper's "skinning").
 
-    ``vertices`` (n,): positions [mm] at the last ``update``.
+    They move as the tissue at ``at`` (n, 3) does, by default the tissue where they are. ``vertices`` (n,): positions [mm] at
+    the last ``update``.
     """
 
-    def __init__(self, model: TissueModel, points: np.ndarray) -> None:
-        self.points = np.asarray(points, np.float64)
-        frame, weight = model.attach(self.points)
+    def __init__(self, model: TissueModel, points: np.ndarray, at: np.ndarray | None = None) -> None:
+        points = np.asarray(points, np.float64)
+        self.at = points if at is None else np.asarray(at, np.float64)
+        frame, weight = model.attach(self.at)
         self.model = model
-        given = self.points, self.points, frame, weight
+        given = points, points, frame, weight
         self.vertices, self.rest, self.frame, self.weight = fields_of(*given, within=1)
         self.update()
 
     def attach_again(self) -> None:
         """Attach the points anew, after tissue was removed from the model or restored."""
-        frame, weight = self.model.attach(self.points)
+        frame, weight = self.model.attach(self.at)
         fill((self.frame, frame), (self.weight, weight))
 
     def update(self) -> None:

@@ -32,5 +32,16 @@ def reachable(
     return can
 
 
+def clear_of_organ(manipulator: ProbeManipulator, poses: np.ndarray) -> np.ndarray:
+    """Whether the probe is outside the settled organ at each of the poses (n, 4, 4), bool (n,)."""
+    half = manipulator.size_mm / 2
+    return np.array(
+        [
+            not (np.abs((manipulator.samples - at[:3, 3]) @ at[:3, :3]) < half).all(axis=1).any()
+            for at in poses
+        ]
+    )
+
+
 def _within(cosine: np.ndarray, most_deg: float) -> np.ndarray:
     return cosine >= np.cos(np.radians(most_deg)) - 1e-9

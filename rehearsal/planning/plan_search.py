@@ -155,8 +155,8 @@ def make_plan(workers: Trials, speed_mm_s: float, trials: int, progress: Progres
     searches = search(kinds, workers, trials, progress)
     if not searches:
         raise PlanError(
-            "no sweep was found that an instrument through the trocar can hold at all poses; move the trocar, widen its cone, "
-            "or give the search more --trials"
+            "no sweep was found that an instrument through the trocar can hold at all poses, and that starts outside the organ; move the "
+            "trocar, widen its cone, or give the search more --trials"
         )
     rows = ranked(searches, workers, speed_mm_s, progress)
     sweeps = [

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from rehearsal.planning.instrument_reach import reachable
+from rehearsal.planning.instrument_reach import clear_of_organ, reachable
 from rehearsal.planning.plan_file import DEG_PER_MM, LIFT_MM, PlanError
 from rehearsal.planning.sweep_score import MEANS, ScoreTerms, TriedPass, face_centres, incidence_deg, path_mm
 from rehearsal.rehearsal import Rehearsal
@@ -114,13 +114,16 @@ class Trial:
             return ScoreTerms()
         compression, poses = np.array(compression_mm), np.concatenate(passes)
         limit = self.rehearsal.scene.transducer.compression_warning_mm
+        # A pass starts with the probe lifted: in a hollow of the organ it may then be inside another part of it.
+        starts = np.stack([advanced(each[0], -LIFT_MM) for each in passes])
+        held = np.concatenate([self.reach(poses), clear_of_organ(self.rehearsal.manipulator, starts)])
         return ScoreTerms(
             compression_mean_mm=float(compression.mean()),
             compression_max_mm=float(compression.max()),
             over_limit=float(((compression > limit) | restored).mean()),
             contact=float(np.mean(contact)),
             incidence_deg=incidence_deg(self.rehearsal.manipulator, poses),
-            reachable=float(self.reach(poses).mean()),
+            reachable=float(held.mean()),
             **others,
         )
 

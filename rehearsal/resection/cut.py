@@ -6,19 +6,22 @@ The resection surface is the lower side of a convex hull, of the line and of wha
 - enucleoresection: the tumour and a margin;
 - wedge: straight walls that meet below the tumour and the margin, in a ridge along the line's longest extent.
 
-The cut never extends beyond the line, seen along the line's direction. Techniques: Minervini et al. 2014, "Standardized reporting of
+The cut never extends beyond the line, seen along the line's direction, but for what the line encloses and bulges over it: all of
+a tumour that protrudes from the kidney comes with the specimen. Techniques: Minervini et al. 2014, "Standardized reporting of
 resection technique during nephron-sparing surgery: the Surface-Intermediate-Base margin score" (Eur. Urol. 66:803).
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import manifold3d
 import numpy as np
 import trimesh
+from matplotlib.path import Path
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from rehearsal.resection.score_line import ResectionError, ScoreLine, places_on
+from rehearsal.resection.score_line import ResectionError, ScoreLine, enclosed_by, places_on
 from render.viewer import Technique
 from scenes.solids import solid_of, surface_of
 from ultrasound.crater import Filling
@@ -27,6 +30,8 @@ from ultrasound.crater import Filling
 EDGE_MM, SIMPLIFIED_MM = 2.0, 0.05
 # The cutter extends this far above the organ.
 ABOVE_MM = 5.0
+# It is this much wider than what bulges over the line, so that it does not graze that.
+BESIDE_MM = 1.0
 # A floor at a given depth is this part of the line's width.
 FLOOR_SHARE = 0.5
 LEAST_SPECIMEN_ML, MOST_OF_ORGAN = 0.1, 0.5
@@ -131,14 +136,30 @@ def _cutter(
     top = float(((np.asarray(organ.vertices) - middle) @ axes.T)[:, 2].max()) + ABOVE_MM
     around = (tumour_points - middle) @ axes.T
     below = _below(rim, settings, around)
-    raised = [np.column_stack([points[:, :2], np.full(len(points), top)]) for points in (rim, below)]
-    hull = manifold3d.Manifold.hull_points(np.concatenate([rim, below, *raised]))
-    column = manifold3d.CrossSection([rim[:, :2]], manifold3d.FillRule.NonZero).extrude(
-        2 * top - below[:, 2].min()
-    )
+    outline = _outline([rim])
+    enclosed = (organ.triangles[enclosed_by(organ, line)].view(np.ndarray) - middle) @ axes.T
+    bulge = _bulge(enclosed, outline)
+    edge = [rim, below, grown(bulge.reshape(-1, 3), BESIDE_MM)]
+    raised = [np.column_stack([points[:, :2], np.full(len(points), top)]) for points in edge]
+    hull = manifold3d.Manifold.hull_points(np.concatenate([*edge, *raised]))
+    outline += _outline(bulge).offset(BESIDE_MM, manifold3d.JoinType.Round)
+    column = outline.extrude(2 * top - below[:, 2].min())
     cutter = hull ^ column.translate([0.0, 0.0, below[:, 2].min() - top / 2])
     placed = np.column_stack([axes.T, middle])
     return cutter.simplify(SIMPLIFIED_MM).refine_to_length(EDGE_MM).transform(placed)
+
+
+def _bulge(enclosed: np.ndarray, outline: manifold3d.CrossSection) -> np.ndarray:
+    """The triangles (n, 3, 3) of a surface that are beyond the line's outline by more than BESIDE_MM, along the axes of the line."""
+    around = Path(outline.offset(BESIDE_MM, manifold3d.JoinType.Round).to_polygons()[0])
+    seen = around.contains_points(enclosed[:, :, :2].reshape(-1, 2))
+    return enclosed[~seen.reshape(-1, 3).all(axis=1)]
+
+
+def _outline(polygons: Iterable[np.ndarray]) -> manifold3d.CrossSection:
+    """The union of closed polygons (k, 3), seen along the third axis; either way round."""
+    sections = [manifold3d.CrossSection([each[:, :2]], manifold3d.FillRule.NonZero) for each in polygons]
+    return manifold3d.CrossSection.batch_boolean(sections, manifold3d.OpType.Add)
 
 
 def _below(rim: np.ndarray, settings: CutSettings, tumour: np.ndarray) -> np.ndarray:

@@ -38,6 +38,7 @@ def marks_around(
     normals, apart = outline.equations[:, :2], -outline.equations[:, :2] @ middle - outline.equations[:, 2]
     height = float((np.asarray(tumour.vertices) @ direction).mean())
     solid = solid_of(organ, "organ")
+    beyond = _beyond(organ, tumour, margin_mm + SLACK_MM)
     above = float((np.asarray(organ.vertices) @ direction).max()) + 1.0
     below = float((np.asarray(organ.vertices) @ direction).min()) - 1.0
     marks = []
@@ -47,9 +48,20 @@ def marks_around(
         edge = middle + ray * float((apart[ahead] / (normals[ahead] @ ray)).min())
         start, end = np.array([*edge, above]) @ axes, np.array([*edge, below]) @ axes
         hits = solid.ray_cast(start, end)
-        # Beside the organ: its nearest place.
-        marks.append(hits[0].position if hits else np.array([*edge, height]) @ axes)
+        if hits:
+            marks.append(hits[0].position)
+        else:
+            # Beside the organ: its nearest place, not on the tumour.
+            away = np.linalg.norm(beyond - np.array([*edge, height]) @ axes, axis=1)
+            marks.append(beyond[away.argmin()])
     return places_on(organ, np.array(marks))[0]
+
+
+def _beyond(organ: trimesh.Trimesh, tumour: trimesh.Trimesh, margin_mm: float) -> np.ndarray:
+    """The vertices (n, 3) of an organ that are farther from a tumour than a margin [mm]; all where none is."""
+    vertices = np.asarray(organ.vertices, float)
+    beyond = vertices[np.linalg.norm(places_on(tumour, vertices)[0] - vertices, axis=1) > margin_mm]
+    return beyond if len(beyond) else vertices
 
 
 def line_around(

@@ -62,8 +62,8 @@ def save_page(rehearsal: Rehearsal, report: dict[str, Any], out: Path) -> list[P
     for place, (title, eye, up) in enumerate(VIEWS):
         axes = figure.add_axes((0.01 + 0.3 * place, 0.14, 0.3, 0.76), projection="3d")
         _draw_specimen(axes, faces @ _axes(cut, eye, up).T, colours, title)
-    _draw_histogram(figure.add_axes((0.67, 0.12, 0.31, 0.28)), judgement)
-    _draw_figures(figure, report)
+    lowest = _draw_figures(figure, report)
+    _draw_histogram(figure.add_axes((0.67, 0.12, 0.31, min(0.28, lowest - 0.15))), judgement)
     _draw_legend(figure)
     page, figures = out / f"{NAME}.png", out / f"{NAME}.json"
     save_figure(figure, page, dpi=110)
@@ -135,7 +135,8 @@ def _draw_legend(figure: Figure) -> None:
     )
 
 
-def _draw_figures(figure: Figure, report: dict[str, Any]) -> None:
+def _draw_figures(figure: Figure, report: dict[str, Any]) -> float:
+    """Write the figures, and return the height below the last one, as a share of the page."""
     rows = rows_of(report)
     figure.text(0.03, 0.93, "Resection", fontsize=17, weight="bold")
     height = 0.93
@@ -144,6 +145,7 @@ def _draw_figures(figure: Figure, report: dict[str, Any]) -> None:
         lines = textwrap.wrap(value, TEXT_WIDTH)
         figure.text(0.755, height, "\n".join(lines), fontsize=10.5, va="top")
         height -= 0.038 * len(lines)
+    return height
 
 
 def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:

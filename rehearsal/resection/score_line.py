@@ -11,6 +11,8 @@ from errors import UserError
 LEAST_MARKS = 3
 # Distance of neighbouring points of the line [mm].
 SPACING_MM = 1.0
+# Distance of the points [mm] at which it is known which faces the line crosses.
+CROSSED_MM = 0.2
 # A mark within a face keeps this share of distance from its edges: so that no face of the divided surface is flat.
 LEAST_SHARE = 0.02
 # A line that encloses less than this share of a circle of its length is folded.
@@ -78,6 +80,20 @@ def places_on(organ: trimesh.Trimesh, points: np.ndarray) -> tuple[np.ndarray, n
     _, face, near = igl.point_mesh_squared_distance(np.atleast_2d(np.asarray(points, float)), vertices, faces)
     face, near = np.atleast_1d(face), np.atleast_2d(near)
     return near, np.asarray(organ.face_normals)[face]
+
+
+def enclosed_by(organ: trimesh.Trimesh, line: ScoreLine) -> np.ndarray:
+    """Which faces (f,) of a surface a line encloses: all that it divides from the largest part, without those that it crosses."""
+    ahead = np.roll(line.points, -1, axis=0) - line.points
+    steps = np.arange(0.0, 1.0, CROSSED_MM / SPACING_MM)
+    points = (line.points[:, None] + steps[:, None] * ahead[:, None]).reshape(-1, 3)
+    vertices, faces = np.asarray(organ.vertices, float), np.asarray(organ.faces, np.int64)
+    free = np.ones(len(faces), bool)
+    free[igl.point_mesh_squared_distance(points, vertices, faces)[1]] = False
+    beside = organ.face_adjacency[free[organ.face_adjacency].all(axis=1)]
+    parts = trimesh.graph.connected_component_labels(beside, len(faces))
+    area = np.bincount(parts, np.where(free, organ.area_faces, 0.0))
+    return free & (parts != area.argmax())
 
 
 def around_middle(points: np.ndarray, normals: np.ndarray) -> np.ndarray:

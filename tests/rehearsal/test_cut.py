@@ -17,7 +17,9 @@ from rehearsal.resection.cut import (
     grown,
     part_left,
 )
+from rehearsal.resection.proposal import line_around
 from rehearsal.resection.score_line import ResectionError, score_line
+from scenes.solids import solid_of, surface_of
 
 ORGAN = ball(R)
 LINE = line_on_ball(ORGAN)
@@ -123,6 +125,21 @@ def test_what_is_cut_in_another_place_stays_with_a_warning():
     # The column through the upper arm, 20 mm high.
     assert "another place" in warning and f"{np.pi * 64 * 20 / 1000:.1f} ml" in warning
     assert made.specimen.volume + made.remnant.volume == pytest.approx(organ.volume, rel=1e-9)
+
+
+@pytest.mark.parametrize(("technique", "wider"), [("enucleoresection", 0.0), ("wedge", 4.0)])
+def test_a_tumour_that_bulges_over_the_line_comes_with_the_specimen_whole(technique, wider):
+    """A tumour at the end of a slim organ, where there is no room for its margin beside it."""
+    slim, tumour = ball(1.0, fine=3), ball(13.0, (0.0, 0.0, 44.0), fine=3)
+    slim.vertices *= [18.0, 18.0, 45.0]
+    organ = surface_of(solid_of(slim, "kidney") + solid_of(tumour, "tumour"))[0]
+    line = line_around(organ, tumour, 5.0 + wider, np.array([0.0, 0.6, 0.8]))
+    aside = np.linalg.norm(line.points - [0.0, 0.0, 44.0], axis=1)
+    assert aside.min() > 13.0 + 4.0
+    made = cut_organ(organ, line, CutSettings(technique, 5.0), np.asarray(tumour.vertices))
+    margin = np.linalg.norm(made.resection_surface().vertices - [0.0, 0.0, 44.0], axis=1) - 13.0
+    assert margin.min() > 4.5
+    assert made.specimen.vertices[:, 2].max() == pytest.approx(57.0, abs=0.1)
 
 
 def test_what_hangs_on_the_specimen_alone_comes_with_it():

@@ -179,6 +179,15 @@ def test_a_lifted_path_has_no_coverage_and_no_compression(trial):
     assert run(trial, []) == ScoreTerms()
 
 
+def test_a_path_that_starts_in_the_organ_cannot_be_reached(trial, monkeypatch):
+    monkeypatch.setattr(trial, "reach", lambda poses: np.ones(len(poses), bool))
+    path = path_at(trial, 2.0)
+    assert trial.terms(path, [0.0], [1.0]).reachable == 1.0
+    # The housing is 6 mm high: lifted by as much, it is still half in the surface.
+    deep = [np.stack([advanced(pose, 7.0) for pose in each]) for each in path]
+    assert trial.terms(deep, [0.0], [1.0]).reachable < 1.0
+
+
 def test_two_passes_cover_more_than_either_and_the_probe_is_lifted_between(trial):
     both = path_at(trial, 2.0, 2)
     depths: list[float] = []

@@ -173,11 +173,13 @@ def test_the_proposed_line_is_around_tumour_and_margin(margin_mm):
     assert len(marks) == 16
 
 
-def test_beside_the_organ_the_line_is_at_its_nearest_place():
-    tumour = ball(8.0, (R - 4.0, 0.0, 0.0))
-    marks = marks_around(ORGAN, tumour, 5.0, np.array([0.0, 0.0, 1.0]))
+def test_beside_the_organ_the_line_is_at_its_nearest_place_with_the_margin():
+    middle = np.array([R - 4.0, 0.0, 0.0])
+    marks = marks_around(ORGAN, ball(8.0, tuple(middle)), 5.0, np.array([0.0, 0.0, 1.0]))
     assert np.abs(np.linalg.norm(marks, axis=1) - R).max() < 2 * R * inset(ORGAN)
-    assert (np.abs(marks[:, 2]) < 1.0).any()
+    # Some 14 mm from the middle: the vertices of the organ are 2 mm apart.
+    away = np.linalg.norm(marks - middle, axis=1)
+    assert away.min() > 8.0 + 5.0 and (away < 8.0 + 5.5 + 2.0).sum() > 3
 
 
 def test_there_are_enough_marks_for_the_circle():

@@ -160,3 +160,11 @@ def test_labels_name_the_vessels():
     found = measured(DEEP, labels=labels, tissues={1: "kidney", 3: "artery", 4: "vein"})
     assert set(found.distance_mm) == {"artery"}
     assert found.distance_mm["artery"] == pytest.approx(20 - 3 - 12, abs=0.6)
+
+
+def test_a_vessel_that_does_not_reach_the_kidney_is_not_its_own():
+    """As the aorta, where the renal artery is not labelled."""
+    aorta = voxels_of(lambda points: tube(-22.0, 4.0)(points + [0.0, 24.0, 0.0]), (0.8,) * 3)
+    labels = Grid(3.0 * aorta.voxels, aorta.index_from_mm)
+    found = measured(([0.0, 0.0, 8.0], 10.0), labels=labels, tissues={1: "kidney", 3: "vessel"})
+    assert found.distance_mm == {} and found.touches_main_vessel is None

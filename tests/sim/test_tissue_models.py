@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 
+import igl
 import numpy as np
 import pytest
 import taichi as ti
@@ -220,11 +221,25 @@ def test_attached_points_move_with_the_body(free):
     free.put(rest @ turn.T + way)
     # At 60 mm float32 is off by 4e-6 mm, over some ten operations.
     assert np.abs(free.surface() - (free.mesh.vertices @ turn.T + way)).max() < 1e-4
-    # So is what carries the image plane.
+    # So is what carries the image plane; elements move what is beside them as the nearest point of the surface, without turning it.
     embedding = Embedding(free.solver.model, free.mesh, embedding_cell_mm(free.tissue))
     embedding.update()
-    vertices = array_of(embedding.skin.rest) @ turn.T + way
-    assert np.abs(array_of(embedding.skin.vertices) - vertices).max() < 1e-4
+    rest, at = array_of(embedding.skin.rest), embedding.skin.at
+    surface = free.mesh.vertices.view(np.ndarray), free.mesh.faces.view(np.ndarray)
+    on_surface = igl.point_mesh_squared_distance(rest.astype(float), *surface)[2]
+    beside = np.linalg.norm(rest - at, axis=1) > 1e-4
+    assert beside.sum() > 100 and np.abs(at - on_surface)[beside].max() < 1e-4
+    turned = at if free.model == "neo-hookean" else rest
+    assert np.abs(array_of(embedding.skin.vertices) - (turned @ turn.T + way + rest - turned)).max() < 1e-4
+
+
+def test_a_press_does_not_fold_the_surroundings(laid):
+    embedding = Embedding(laid.solver.model, laid.mesh, embedding_cell_mm(laid.tissue), margin_mm=25.0)
+    laid.press(laid.settings(G), 18.0, 13.0, 12)
+    embedding.update()
+    first, *others = array_of(embedding.skin.vertices)[array_of(embedding.tetrahedron)].transpose(1, 0, 2)
+    volumes = np.linalg.det(np.stack([corner - first for corner in others], axis=1))
+    assert (volumes > 0).all(), (volumes <= 0).sum()
 
 
 def test_pressed_it_deforms_and_recovers(laid):
