@@ -103,7 +103,7 @@ def surrogate_search(trial: Trial, kind: PassKind) -> list[TriedPass]:
 def try_pass(trial: Trial, kind: PassKind, parameters: np.ndarray) -> TriedPass | None:
     """Try one pass; None where the instrument cannot hold it."""
     poses = kind.poses(trial.rehearsal.manipulator, kind.values(parameters))
-    return None if poses is None or not trial.reach(poses).all() else trial.try_pass(parameters, poses)
+    return None if poses is None or not trial.held([poses]).all() else trial.try_pass(parameters, poses)
 
 
 def try_sweep(trial: Trial, kind: PassKind, parameters: list[np.ndarray], speed_mm_s: float) -> TriedPath:

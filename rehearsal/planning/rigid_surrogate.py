@@ -38,7 +38,7 @@ class RigidSurrogate:
     def try_pass(self, kind: PassKind, parameters: np.ndarray) -> TriedPass | None:
         """A pass over the rigid organ; None where the instrument cannot hold it. Compression is the depth of the array below the surface."""
         poses = kind.poses(self.manipulator, kind.values(parameters))
-        if poses is None or not self.trial.reach(poses).all():
+        if poses is None or not self.trial.held([poses]).all():
             return None
         rehearsal = self.trial.rehearsal
         planes = image_plane(poses, rehearsal.size_mm[2], 1.0, 1.0).world_from_plane

@@ -114,16 +114,13 @@ class Trial:
             return ScoreTerms()
         compression, poses = np.array(compression_mm), np.concatenate(passes)
         limit = self.rehearsal.scene.transducer.compression_warning_mm
-        # A pass starts with the probe lifted: in a hollow of the organ it may then be inside another part of it.
-        starts = np.stack([advanced(each[0], -LIFT_MM) for each in passes])
-        held = np.concatenate([self.reach(poses), clear_of_organ(self.rehearsal.manipulator, starts)])
         return ScoreTerms(
             compression_mean_mm=float(compression.mean()),
             compression_max_mm=float(compression.max()),
             over_limit=float(((compression > limit) | restored).mean()),
             contact=float(np.mean(contact)),
             incidence_deg=incidence_deg(self.rehearsal.manipulator, poses),
-            reachable=float(held.mean()),
+            reachable=float(self.held(passes).mean()),
             **others,
         )
 
@@ -151,6 +148,13 @@ class Trial:
         terms = self.terms([poses], compression_mm, contact, restored)
         sums = len(poses) * np.array([getattr(terms, name) for name in MEANS])
         return TriedPass(parameters, seen, sums, len(poses), path_mm(self.rehearsal.manipulator, poses))
+
+    def held(self, passes: list[np.ndarray]) -> np.ndarray:
+        """Whether the instrument can hold each pose; and for each pass whether the lifted probe is outside the organ, where it starts."""
+        # In a hollow of the organ it may be inside another part of it.
+        starts = np.stack([advanced(each[0], -LIFT_MM) for each in passes])
+        clear = clear_of_organ(self.rehearsal.manipulator, starts)
+        return np.concatenate([self.reach(np.concatenate(passes)), clear])
 
     def _begin(self, speed_mm_s: float) -> None:
         self.rehearsal.reset()

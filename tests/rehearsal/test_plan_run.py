@@ -95,8 +95,10 @@ def test_the_score_terms_of_a_plan_are_those_of_its_sweep_tried_again(made):
     """Of the poses in the file, which are rounded to six digits."""
     sweep = made.plan.sweeps[0]
     terms = vars(made.trial.run(planned(made.trial, sweep), made.plan.speed_mm_s))
-    # Not one step more or less; the file's figures have six digits.
-    assert terms.pop("time_s") == pytest.approx(sweep.parts["time_s"], rel=1e-5)
+    # Not one step more or less, but on the way from one pass to the next, which depends on the last digits.
+    steps = len(sweep.passes) - 1 + 1e-3
+    step_s = made.trial.rehearsal.settings.time_step_s
+    assert terms.pop("time_s") == pytest.approx(sweep.parts["time_s"], abs=steps * step_s)
     assert terms == pytest.approx({name: sweep.parts[name] for name in terms}, abs=1e-2)
     assert sweep.parts["reachable"] == 1.0 and sweep.parts["seen"] > 0
     assert made.plan.version == VERSION

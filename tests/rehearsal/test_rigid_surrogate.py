@@ -50,7 +50,7 @@ def surrogate_of(monkeypatch, probe) -> tuple[RigidSurrogate, Coverage]:
     trial = SimpleNamespace(
         rehearsal=held,
         sampled_places=coverage.voxel_centres("tumour"),
-        reach=lambda poses: poses[:, 0, 3] < 100.0,
+        held=lambda passes: np.concatenate(passes)[:, 0, 3] < 100.0,
     )
     trial.terms, trial.tried = partial(Trial.terms, trial), partial(Trial.tried, trial)
     return RigidSurrogate(trial), coverage
