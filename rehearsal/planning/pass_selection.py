@@ -16,45 +16,63 @@ TRANSFER_MM = 30.0
 BEGINNINGS = 12
 
 
-def scores_with(pool: Sequence[TriedPass], others: Sequence[TriedPass]) -> np.ndarray:
-    """The score (k,) of each pass of a pool, together with other passes."""
-    weight = {name: points for name, (points, *_) in WORDING.items()}
-    seen = np.stack([each.seen for each in pool])
-    if others:
-        seen = seen | np.any([each.seen for each in others], axis=0)
-    sums = np.stack([each.sums for each in pool]) + sum(each.sums for each in others)
-    poses = np.array([each.poses for each in pool]) + sum(each.poses for each in others)
-    path_mm = np.array([each.path_mm for each in pool]) + sum(each.path_mm + TRANSFER_MM for each in others)
-    means = sums / poses[:, None] @ [weight[name] for name in MEANS]
-    return weight["seen"] * seen.mean(axis=1) + means + weight["path_mm"] * path_mm
+class PassPool:
+    """Tried passes as arrays, so that sets of them have their scores at once; a set is a list of their numbers."""
+
+    def __init__(self, passes: Sequence[TriedPass]) -> None:
+        weight = {name: points for name, (points, *_) in WORDING.items()}
+        self._seen = np.stack([each.seen for each in passes]).astype(np.float32)
+        self._means = np.stack([each.sums for each in passes]) @ [weight[name] for name in MEANS]
+        self._poses = np.array([each.poses for each in passes])
+        self._path = weight["path_mm"] * np.array([each.path_mm for each in passes])
+        self._seen_points, self._transfer = (
+            weight["seen"] / self._seen.shape[1],
+            weight["path_mm"] * TRANSFER_MM,
+        )
+
+    def scores_with(self, chosen: list[int]) -> np.ndarray:
+        """The score (k,) of a set of passes, together with each other one; minus infinity for those of the set."""
+        unseen = 1.0 - self._seen[chosen].max(axis=0, initial=0.0)
+        seen = self._seen @ unseen + (len(unseen) - unseen.sum())
+        means = (self._means + self._means[chosen].sum()) / (self._poses + self._poses[chosen].sum())
+        path = self._path + self._path[chosen].sum() + len(chosen) * self._transfer
+        scores = self._seen_points * seen + means + path
+        scores[chosen] = -np.inf
+        return scores
+
+    def score(self, chosen: list[int]) -> float:
+        """The score of a set of passes; minus infinity without one."""
+        return float(self.scores_with(chosen[1:])[chosen[0]]) if chosen else -np.inf
+
+    def best(self) -> list[int]:
+        """The passes that have the best score together: by adding, exchanging and removing passes while that makes it better."""
+        begins = np.argsort(-self.scores_with([]), kind="stable")[:BEGINNINGS]
+        return max((self._improved([int(begin)]) for begin in begins), key=self.score)
+
+    def _improved(self, chosen: list[int]) -> list[int]:
+        """The set after all changes of one pass that make its score better."""
+        least = self.score(chosen)
+        while True:
+            best, changed = least, chosen
+            kept = [chosen[:place] + chosen[place + 1 :] for place in range(len(chosen))]
+            for others in [chosen, *kept] if len(chosen) < MOST_PASSES else kept:
+                scores = self.scores_with(others)
+                for score, some in (
+                    (float(scores.max()), [*others, int(scores.argmax())]),
+                    (self.score(others), others),
+                ):
+                    if score > best:
+                        best, changed = score, some
+            if best <= least + 1e-9:
+                return chosen
+            least, chosen = best, changed
+
+
+def best_selection(passes: Sequence[TriedPass]) -> list[TriedPass]:
+    """The passes that have the best score together."""
+    return [passes[number] for number in PassPool(passes).best()] if passes else []
 
 
 def score_of(passes: Sequence[TriedPass]) -> float:
     """The score of passes together; minus infinity without one."""
-    return float(scores_with(passes[:1], passes[1:])[0]) if passes else -np.inf
-
-
-def best_selection(pool: Sequence[TriedPass]) -> list[TriedPass]:
-    """Passes of a pool that have the best score together: by adding, exchanging and removing passes while that makes it better."""
-    if not pool:
-        return []
-    begins = np.argsort(-scores_with(pool, []), kind="stable")[:BEGINNINGS]
-    return max((_improved([pool[begin]], pool) for begin in begins), key=score_of)
-
-
-def _improved(chosen: list[TriedPass], pool: Sequence[TriedPass]) -> list[TriedPass]:
-    """The chosen passes after all changes of one pass that make their score better."""
-    least, number_of = score_of(chosen), {id(each): number for number, each in enumerate(pool)}
-    while True:
-        best, changed = least, chosen
-        kept = [chosen[:number] + chosen[number + 1 :] for number in range(len(chosen))]
-        for others in [chosen, *kept] if len(chosen) < MOST_PASSES else kept:
-            scores = scores_with(pool, others)
-            scores[[number_of[id(each)] for each in others]] = -np.inf
-            if scores.max() > best:
-                best, changed = float(scores.max()), [*others, pool[int(scores.argmax())]]
-            if score_of(others) > best:
-                best, changed = score_of(others), others
-        if best <= least + 1e-9:
-            return chosen
-        least, chosen = best, changed
+    return PassPool(passes).score(list(range(len(passes)))) if passes else -np.inf

@@ -47,8 +47,8 @@ def sliding(
     for number, aside in enumerate(aside_mm):
         # The longest run of poses without a gap.
         runs: list[list[np.ndarray]] = [[]]
-        for ahead in np.linspace(start_mm, end_mm, count)[:: (-1) ** number]:
-            pose = pose_over(manipulator, frame, aside, ahead, depth_mm, follow)
+        ahead = np.linspace(start_mm, end_mm, count)[:: (-1) ** number]
+        for pose in poses_over(manipulator, frame, aside, ahead, depth_mm, follow):
             if pose is None:
                 runs.append([])
             else:
@@ -85,14 +85,30 @@ def pose_over(
     follow: float,
 ) -> np.ndarray | None:
     """The pose (4, 4) at an offset in a frame; None beside the organ."""
-    lateral, ahead, outward, centre = frame[:3].T
-    over = centre + aside_mm * lateral + ahead_mm * ahead
-    place = manipulator.ray_hit(over + FAR_MM * outward, -outward)
-    if place is None:
-        return None
-    axis = (1 - follow) * outward + follow * manipulator.surface_normal(place)
-    pose = pose_at(place, -axis, lateral, manipulator.size_mm[2])
-    return advanced(touching(pose, manipulator.size_mm, manipulator.samples, manipulator.radius_mm), depth_mm)
+    return poses_over(manipulator, frame, aside_mm, np.array([ahead_mm]), depth_mm, follow)[0]
+
+
+def poses_over(
+    manipulator: ProbeManipulator,
+    frame: np.ndarray,
+    aside_mm: float,
+    ahead_mm: np.ndarray,
+    depth_mm: float,
+    follow: float,
+) -> list[np.ndarray | None]:
+    """The poses (4, 4) at offsets (n,) ahead in a frame; None beside the organ."""
+    lateral, forwards, outward, centre = frame[:3].T
+    above = centre + aside_mm * lateral + ahead_mm[:, None] * forwards + FAR_MM * outward
+    distance = manipulator.ray_distances(above, np.tile(-outward, (len(above), 1)))
+    over = np.isfinite(distance)
+    places = above[over] - distance[over, None] * outward
+    axes = (1 - follow) * outward + follow * manipulator.surface_normals(places)
+    size, samples, radius = manipulator.size_mm, manipulator.samples, manipulator.radius_mm
+    found: list[np.ndarray | None] = [None] * len(above)
+    for number, place, axis in zip(np.flatnonzero(over), places, axes, strict=True):
+        pose = touching(pose_at(place, -axis, lateral, size[2]), size, samples, radius)
+        found[number] = advanced(pose, depth_mm)
+    return found
 
 
 def tilted(pose: np.ndarray, length_mm: float, angle_deg: float) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rehearsal.planning.pass_kinds import MOST_PASSES
-from rehearsal.planning.pass_selection import TRANSFER_MM, best_selection, score_of, scores_with
+from rehearsal.planning.pass_selection import TRANSFER_MM, PassPool, best_selection, score_of
 from rehearsal.planning.sweep_score import MEANS, ScoreTerms, TriedPass, score
 
 
@@ -39,9 +39,13 @@ def score_by_hand(passes: list[TriedPass]) -> float:
 
 def test_a_set_has_the_score_of_its_terms():
     pool = random_passes(7)
-    for others in ([], pool[:1], pool[2:5]):
-        wanted = [score_by_hand([*others, each]) for each in pool]
-        assert scores_with(pool, others) == pytest.approx(wanted, abs=1e-9)
+    for chosen in ([], [0], [2, 3, 4]):
+        wanted = [
+            -np.inf if number in chosen else score_by_hand([*(pool[k] for k in chosen), each])
+            for number, each in enumerate(pool)
+        ]
+        # The seen places are counted in float32, which has whole numbers.
+        assert PassPool(pool).scores_with(chosen) == pytest.approx(wanted, abs=1e-4)
     assert score_of(pool[:3]) == pytest.approx(score_by_hand(pool[:3])) and score_of([]) == -np.inf
 
 
