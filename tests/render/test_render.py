@@ -14,9 +14,11 @@ from null_viewer import NullViewer
 from render import background_image, transducer_shape, ultrasound_panel
 from render.camera import OrbitCamera
 from render.cut_face import FLESH
-from render.display import display_available, fitted, window_size
+from render.display import display_available, fitted, scale_of, window_size
+from render.sliders import slider_image
 from render.software_scene import SoftwareScene
 from render.viewer import Controls, Geometry, Settings, View
+from render.warning_box import warning_image, warning_rect
 from render.window_layout import FULL_SIZE, RULER_WIDTH, WindowLayout
 from sim.fields import fill
 
@@ -296,7 +298,9 @@ def test_organ_never_covers_the_panel_the_title_or_the_readouts(window):
     opened.camera.zoom(0.01)
     left, bottom, right, top = opened.camera.part
     opened.camera.pan(0.62 - (left + right) / 2, 0.5 - (bottom + top) / 2)
-    opened.draw(_far_view())
+    warnings = ("Import: check the side of the organ in check.png",)
+    opened.settings.show_scanner = opened.settings.show_resection = True
+    opened.draw(dataclasses.replace(_far_view(), warnings=warnings, findings={"to tumour": "4.2 mm"}))
     picture = opened.picture()
     red = _organ_pixels(picture)
     layout = opened.layout
@@ -306,6 +310,12 @@ def test_organ_never_covers_the_panel_the_title_or_the_readouts(window):
     for rect in (layout.panel, layout.title):
         assert np.array_equal(picture[rect.slices], expected[rect.slices])
     assert np.array_equal(picture[layout.readouts.slices], background_image.readout_image(layout, {}))
+    taken = layout.scene.right - opened._sliders[-1].box.left
+    boxes = [(warning_rect(layout, warnings, taken), warning_image(layout, warnings, taken))]
+    boxes += [(each.box, slider_image(each)) for each in opened._sliders]
+    assert len(boxes) > 4
+    for box, image in boxes:
+        assert np.array_equal(picture[box.slices], image)
 
 
 def test_processor_and_vulkan_draw_the_same_picture(window):
@@ -343,6 +353,16 @@ def test_two_pictures_of_one_view_are_the_same(window):
     opened, _, _ = window
     opened.draw(_view(status="FROZEN"))
     assert np.array_equal(opened.picture(), opened.picture())
+
+
+def test_other_geometry_has_its_own_sliders(window):
+    opened, field, _ = window
+    faces = opened._geometry.organ[1]
+    opened.draw(_view())
+    before = opened.picture()
+    opened.change_geometry(dataclasses.replace(opened._geometry, tumour=(field, faces)))
+    after = opened.picture()
+    assert np.any(before != after, axis=2)[opened.layout.strip.slices].any()
 
 
 @pytest.mark.parametrize(("setting", "value"), [("translucent", True), ("cut", True), ("level_hu", 90)])
@@ -421,10 +441,28 @@ def test_a_missing_display_is_detected(monkeypatch, display):
     ("screen", "size"),
     [
         ((1920, 1080), (1280, 720)),
-        ((3840, 2160), (1280, 720)),
+        ((3840, 2160, 1.0), (1280, 720)),
+        ((3840, 2160, 2.0), (2560, 1440)),
+        ((2880, 1620, 1.5), (1920, 1080)),
+        ((1920, 1080, 2.0), (1664, 936)),
         ((1366, 768), (1152, 648)),
         ((1080, 1920), (1024, 576)),
     ],
 )
 def test_a_window_fits_its_screen(screen, size):
     assert fitted(*screen) == size
+
+
+@pytest.mark.parametrize(
+    ("resources", "scale"),
+    [
+        (b"", 1.0),
+        (b"Xcursor.size:\t24\nXft.dpi:\t192\nXft.rgba:\tnone\n", 2.0),
+        (b"Xft.dpi: 144.0", 1.5),
+        (b"Xft.dpi:\t72\n", 1.0),
+        (b"Xft.dpi: 9600", 4.0),
+        (b"*Xft.dpi.other: 192", 1.0),
+    ],
+)
+def test_the_scale_is_that_of_the_desktop(resources, scale):
+    assert scale_of(resources) == scale
