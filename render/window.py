@@ -206,6 +206,9 @@ class Window:
         for event in self._window.get_events(ti.ui.PRESS):
             self._key_down(event.key, controls)
         for event in self._window.get_events(ti.ui.RELEASE):
+            # GGUI tells presses and releases of a slow frame apart, but not their order: what is held now was pressed last.
+            if self._window.is_pressed(event.key):
+                continue
             if event.key == ti.ui.LMB:
                 self._pressing, self._moved_slider = False, None
             elif event.key in (ti.ui.RMB, ti.ui.MMB):

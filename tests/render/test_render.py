@@ -4,6 +4,7 @@ import dataclasses
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -353,6 +354,110 @@ def test_two_pictures_of_one_view_are_the_same(window):
     opened, _, _ = window
     opened.draw(_view(status="FROZEN"))
     assert np.array_equal(opened.picture(), opened.picture())
+
+
+class Mouse:
+    """Stands for GGUI's window: a mouse at a pixel of a window of 640 x 360, and what was pressed and released since the last frame."""
+
+    running = True
+
+    def __init__(self) -> None:
+        self.at, self.held, self.events = (0.0, 0.0), set(), {"Press": [], "Release": []}
+
+    def goes(self, column: float, row: float) -> None:
+        self.at = column / 640, 1 - row / 360
+
+    def presses(self, key: str) -> None:
+        self.held.add(key)
+        self.events["Press"].append(SimpleNamespace(key=key))
+
+    def releases(self, key: str) -> None:
+        self.held.discard(key)
+        self.events["Release"].append(SimpleNamespace(key=key))
+
+    def get_cursor_pos(self) -> tuple[float, float]:
+        return self.at
+
+    def is_pressed(self, *keys: str) -> bool:
+        return any(key in self.held for key in keys)
+
+    def get_events(self, tag: str) -> list[SimpleNamespace]:
+        found, self.events[tag] = self.events[tag], []
+        return found
+
+
+@pytest.fixture
+def mouse(window, monkeypatch):
+    """The mouse of a visible window, its sliders placed."""
+    opened, _, _ = window
+    opened.draw(_view())
+    opened.picture()
+    mouse = Mouse()
+    with monkeypatch.context() as patch:
+        patch.setattr(opened, "_window", mouse)
+        patch.setattr(opened, "_visible", True)
+        yield mouse
+
+
+def slider_of(opened, name: str):
+    return next(each for shown in opened._sliders for each in shown.sliders if each.name == name)
+
+
+def test_a_slider_follows_the_mouse_slowly_with_shift_until_it_is_let_go(window, mouse):
+    import taichi as ti
+
+    opened, _, _ = window
+    level = slider_of(opened, "level_hu")
+    middle, row = level.track.left + level.track.width / 2, level.track.top + 3
+
+    def now() -> int:
+        opened.read_controls()
+        return opened.settings.level_hu
+
+    mouse.goes(middle, row)
+    before = now()
+    mouse.presses(ti.ui.LMB)
+    assert abs(now()) < 10 and before == 40
+    mouse.goes(middle + level.track.width / 4, 0)
+    assert abs(now() - 250) < 10, "the slider does not follow the mouse beside its row"
+    mouse.presses(ti.ui.SHIFT)
+    mouse.goes(middle, row)
+    assert abs(now() - 225) < 10, "shift does not slow the slider down"
+    mouse.releases(ti.ui.LMB)
+    now()
+    mouse.goes(level.track.left, row)
+    assert abs(now() - 225) < 10, "the slider goes on when it is let go"
+
+
+def test_a_switch_turns_with_each_press_and_none_behind_the_help(window, mouse):
+    import taichi as ti
+
+    opened, _, _ = window
+    track = slider_of(opened, "cut").track
+    mouse.goes(track.left + 2, track.top + 2)
+    seen = []
+    for key in (ti.ui.LMB, ti.ui.LMB, "h", ti.ui.LMB):
+        opened._place_sliders()
+        mouse.presses(key)
+        mouse.releases(key)
+        opened.read_controls()
+        seen.append(opened.settings.cut)
+    assert seen == [True, False, False, False]
+
+
+def test_a_button_that_is_pressed_again_within_a_slow_frame_stays_pressed(window, mouse):
+    import taichi as ti
+
+    opened, _, _ = window
+    mouse.goes(opened.layout.clear.left + 100, opened.layout.clear.top + 60)
+    assert not opened.read_controls().press
+    mouse.presses(ti.ui.LMB)
+    assert opened.read_controls().press
+    mouse.releases(ti.ui.LMB)
+    mouse.presses(ti.ui.LMB)
+    assert opened.read_controls().press
+    mouse.releases(ti.ui.LMB)
+    assert not opened.read_controls().press
 
 
 def test_other_geometry_has_its_own_sliders(window):
