@@ -13,8 +13,8 @@ from render.window_layout import WEDGE_WIDTH, Rect, WindowLayout
 PANEL, FINDINGS, LINE = (8, 9, 11), (20, 24, 29), (44, 50, 58)
 TEXT, QUIET = (222, 227, 232), (132, 142, 153)
 MARK, ALERT = (64, 196, 255), (255, 176, 46)
-OUTLINE, OUTLINE_AT_REST, CALIPER = (237, 194, 71), (150, 128, 196), (120, 230, 140)
-RESECTION_LINE = (90, 190, 255)
+OUTLINE, OUTLINE_AT_REST, CALIPER = (237, 194, 71), (146, 121, 187), (151, 248, 154)
+RESECTION_LINE = (88, 188, 254)
 CROSS_PX, NUMBER_PX, NOTE_PX, HINT_PX, FIGURE_PX = 5, 16, 17, 14, 15
 # Legend of the tumour's outlines.
 LEGEND = (("tumour now", OUTLINE), ("in the CT", OUTLINE_AT_REST))
