@@ -88,6 +88,7 @@ class Window:
         self._view: View | None = None
         self._quit = False
         self._help_shown = False
+        self._warm_up = 2
         self._drag: str | None = None
         self._cursor: np.ndarray | None = None
         self._pressing = False
@@ -274,6 +275,11 @@ class Window:
         """Return the last view drawn, uint8, shape (height, width, 3). Raises RuntimeError if nothing was drawn."""
         if self._view is None:
             raise RuntimeError("nothing was drawn yet")
+        # In the first frames of some drivers a body may be missing.
+        while not self._visible and self._software is None and self._warm_up > 0:
+            self._warm_up -= 1
+            self._draw_frame(self._view)
+            self._window.get_image_buffer_as_numpy()
         self._draw_frame(self._view)
         colours = self._window.get_image_buffer_as_numpy()
         if self._visible:
