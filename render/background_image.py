@@ -1,4 +1,4 @@
-"""The image behind the 3D view: ultrasound panel, title, clock, help, read-outs, findings and compass. Images are uint8 (height, width, 3).
+"""The image behind the 3D view: ultrasound panel, title, clock, help, sliders, read-outs, findings and compass. Images are uint8 (height, width, 3).
 
 Each frame redraws only what changed.
 """
@@ -11,10 +11,10 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from render.keys import Keys
+from render.sliders import SliderBox, slider_image
 from render.text import fitting_size, font, shortened
 from render.ultrasound_panel import (
     ALERT,
-    FIGURE_PX,
     FINDINGS,
     LINE,
     MARK,
@@ -34,7 +34,7 @@ from render.ultrasound_panel import (
 )
 from render.viewer import View
 from render.warning_box import warning_image, warning_rect
-from render.window_layout import CLOCK_WIDTH, FIGURE_HEIGHT, FIGURES_PAD, Rect, WindowLayout
+from render.window_layout import CLOCK_WIDTH, FIGURE_HEIGHT, Rect, WindowLayout
 
 READOUT_PERIOD_S = 0.4
 
@@ -70,6 +70,7 @@ class BackgroundImage:
         # The same memory as rows, top down, for drawing.
         self._rows = self.pixels.transpose(1, 0, 2)[::-1]
         self._view: View | None = None
+        self._sliders: tuple[SliderBox, ...] = ()
         self._backdrop: tuple = ()
         self.has_scene = self._shows_help = False
         self._axes: np.ndarray | None = None
@@ -81,9 +82,10 @@ class BackgroundImage:
         self,
         view: View,
         axes: np.ndarray,
+        sliders: tuple[SliderBox, ...] = (),
         slow_figures: bool = False,
     ) -> None:
-        """Draw a view, with the compass for a camera's axes (3, 3): right, up and ahead, in patient coordinates.
+        """Draw a view and sliders, with the compass for a camera's axes (3, 3): right, up and ahead, in patient coordinates.
 
         With ``slow_figures``, figures change only every READOUT_PERIOD_S, so that they can be read.
         """
@@ -98,10 +100,12 @@ class BackgroundImage:
             view.title,
             len(findings),
             view.warnings,
+            tuple(each.box for each in sliders),
         )
         if self._shows_help or self._backdrop != parts:
             self._rows[:, :, :3] = backdrop(self.layout, view, self.keys.of["help"])
             self._figures, self._axes, self._status, self._shows_help = None, None, None, False
+            self._sliders = ()
             self._empty_scene, self.has_scene = self._scene.copy(), False
         self._view, self._backdrop = view, parts
         for (name, image), box in zip(view.shown.items(), image_boxes(self.layout, view), strict=True):
@@ -115,8 +119,12 @@ class BackgroundImage:
         if self._axes is None or not np.array_equal(axes, self._axes):
             self._put(self.layout.compass, compass_image(self.layout, axes))
             self._axes = axes
-        if (warned := warning_rect(self.layout, view.warnings)) is not None:
-            self._put(warned, warning_image(self.layout, view.warnings))
+        for each in sliders:
+            if each not in self._sliders:
+                self._put(each.box, slider_image(each))
+        self._sliders = sliders
+        if (warned := self._warning_rect(view)) is not None:
+            self._put(warned, warning_image(self.layout, view.warnings, self._taken))
 
     def draw_scene(self, draw: Callable[[np.ndarray], None]) -> None:
         """Draw the 3D view into ``pixels``, behind what ``compose`` has drawn; ``draw`` does it."""
@@ -129,14 +137,23 @@ class BackgroundImage:
         self.has_scene = True
 
     def boxes_over_scene(self, view: View) -> list[Rect]:
-        """The boxes that cover the 3D view: compass, findings, warnings."""
+        """The boxes that cover the 3D view: compass, findings, warnings, the scanner's sliders."""
         count = min(len(view.findings), self.layout.most_findings)
         findings = self.layout.findings(count) if count else None
-        return [
-            box
-            for box in (self.layout.compass, findings, warning_rect(self.layout, view.warnings))
-            if box is not None
-        ]
+        sliders = [each.box for each in self._sliders if each.is_over_scene]
+        boxes = self.layout.compass, findings, self._warning_rect(view), *sliders
+        return [box for box in boxes if box is not None]
+
+    def _warning_rect(self, view: View) -> Rect | None:
+        return warning_rect(self.layout, view.warnings, self._taken)
+
+    @property
+    def _taken(self) -> int:
+        """The width that the scanner's sliders take at the right of the 3D view."""
+        return max(
+            (self.layout.scene.right - each.box.left for each in self._sliders if each.is_over_scene),
+            default=0,
+        )
 
     @property
     def _scene(self) -> np.ndarray:
@@ -156,15 +173,16 @@ class BackgroundImage:
 
     def _draw_over(self, view: View, name: str, box: Rect) -> None:
         """Draw outlines, note and caliper over an image."""
+        width = self.layout.line_width
         if view.outline_before_mm is not None:
-            draw_segments(self._rows, view, box, view.outline_before_mm, OUTLINE_AT_REST)
+            draw_segments(self._rows, view, box, view.outline_before_mm, OUTLINE_AT_REST, width)
         if view.outline_mm is not None:
-            draw_segments(self._rows, view, box, view.outline_mm, OUTLINE)
+            draw_segments(self._rows, view, box, view.outline_mm, OUTLINE, width)
         if view.resection_mm is not None:
-            draw_segments(self._rows, view, box, view.resection_mm, RESECTION_LINE)
+            draw_segments(self._rows, view, box, view.resection_mm, RESECTION_LINE, width)
         if note := view.notes.get(name):
             draw_note(self._rows, self.layout, box, note)
-        draw_caliper(self._rows, view, box, self.layout.px(FIGURE_PX))
+        draw_caliper(self._rows, self.layout, view, box)
 
     def _compose_figures(self, figures: Figures, slow: bool) -> None:
         now = time.perf_counter()
@@ -277,9 +295,9 @@ def readout_image(layout: WindowLayout, readouts: Mapping[str, str]) -> np.ndarr
     image = Image.new("RGB", (box.width, box.height), STRIP)
     draw = ImageDraw.Draw(image)
     draw.line([(0, 0), (box.width, 0)], fill=LINE)
-    room = box.height - 2 * FIGURES_PAD
+    room = box.height - 2 * layout.figures_pad
     pitch = min(layout.px(FIGURE_HEIGHT), max(LEAST_PITCH, room // max(1, len(readouts))))
-    _draw_figures(draw, box, first_of(readouts, room // pitch), "", pitch)
+    _draw_figures(draw, layout, box, first_of(readouts, room // pitch), "", pitch)
     return np.asarray(image)
 
 
@@ -289,7 +307,7 @@ def findings_image(layout: WindowLayout, findings: Mapping[str, str], alert: str
     image = Image.new("RGB", (box.width, box.height), FINDINGS)
     draw = ImageDraw.Draw(image)
     draw.rectangle([0, 0, box.width - 1, box.height - 1], outline=ALERT if alert else LINE)
-    _draw_figures(draw, box, findings, alert, layout.px(FIGURE_HEIGHT))
+    _draw_figures(draw, layout, box, findings, alert, layout.px(FIGURE_HEIGHT))
     return np.asarray(image)
 
 
@@ -299,17 +317,23 @@ def first_of(figures: Mapping[str, str], most: int) -> dict[str, str]:
 
 
 def _draw_figures(
-    draw: ImageDraw.ImageDraw, box: Rect, figures: Mapping[str, str], alert: str, pitch: float
+    draw: ImageDraw.ImageDraw,
+    layout: WindowLayout,
+    box: Rect,
+    figures: Mapping[str, str],
+    alert: str,
+    pitch: float,
 ) -> None:
-    room, most = box.width - FIGURES_GAP_PX, int(0.68 * pitch)
+    px, pad, most = layout.px, layout.figures_pad, int(0.68 * pitch)
+    room = box.width - px(FIGURES_GAP_PX)
     size = min(
         (fitting_size([(f"{name}  {value}",)], room, most) for name, value in figures.items()), default=most
     )
     for i, (name, value) in enumerate(figures.items()):
-        y = FIGURES_PAD + (i + 0.5) * pitch
+        y = pad + (i + 0.5) * pitch
         colours = (ALERT, ALERT) if name == alert else (QUIET, TEXT)
-        draw.text((8, y), name, font=font(size), fill=colours[0], anchor="lm")
-        draw.text((box.width - 10, y), value or NO_VALUE, font=font(size), fill=colours[1], anchor="rm")
+        draw.text((px(8), y), name, font=font(size), fill=colours[0], anchor="lm")
+        draw.text((box.width - px(10), y), value or NO_VALUE, font=font(size), fill=colours[1], anchor="rm")
 
 
 def ends_of(axes: np.ndarray) -> list[tuple[str, np.ndarray]]:

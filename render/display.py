@@ -2,13 +2,16 @@
 
 import ctypes
 import os
+import re
 import sys
 from functools import cache
 
-from render.window_layout import FULL_SIZE
+from render.window_layout import FULL_SIZE, MOST_SCALE
 
 # Fraction of a small screen's height for a window below its title and a task bar; its width is a multiple of STEP.
 HEIGHT_FRACTION, STEP = 0.88, 64
+# Dots per inch at scale 1.
+USUAL_DPI = 96
 
 
 def display_available() -> bool:
@@ -18,25 +21,33 @@ def display_available() -> bool:
 
 def window_size() -> tuple[int, int]:
     """Return width and height of a window [pixels] that fit the screen; FULL_SIZE where it is unknown."""
-    screen = None
-    if sys.platform == "win32":
-        metrics = ctypes.windll.user32.GetSystemMetrics
-        screen = metrics(0), metrics(1)
-    elif sys.platform != "darwin":
+    screen = _of_windows()
+    if sys.platform not in ("win32", "darwin"):
         screen = _of_x11(os.environ.get("DISPLAY"))
     return FULL_SIZE if screen is None else fitted(*screen)
 
 
-def fitted(width: int, height: int) -> tuple[int, int]:
-    """Return the size of a window on a screen of a size [pixels]: FULL_SIZE, or as large as fits."""
+def fitted(width: int, height: int, scale: float = 1.0) -> tuple[int, int]:
+    """Return the size of a window on a screen of a size [pixels]: FULL_SIZE, enlarged by the screen's scale, or as large as fits."""
     room = min(width, HEIGHT_FRACTION * height * FULL_SIZE[0] / FULL_SIZE[1])
-    wide = min(FULL_SIZE[0], int(room) // STEP * STEP)
+    wide = int(min(scale * FULL_SIZE[0], room)) // STEP * STEP
     return wide, wide * FULL_SIZE[1] // FULL_SIZE[0]
 
 
+def _of_windows() -> tuple[int, int, float] | None:
+    """Return width, height and scale of the screen on Windows, in its own pixels, as GLFW does."""
+    if sys.platform != "win32":
+        return None
+    user = ctypes.windll.user32
+    user.SetProcessDPIAware()
+    # Windows 10 and later.
+    dpi = user.GetDpiForSystem() if hasattr(user, "GetDpiForSystem") else USUAL_DPI
+    return user.GetSystemMetrics(0), user.GetSystemMetrics(1), dpi / USUAL_DPI
+
+
 @cache
-def _of_x11(display: str | None) -> tuple[int, int] | None:
-    """Return width and height of an X server's screen. Cached: a server without clients may reset when asked again."""
+def _of_x11(display: str | None) -> tuple[int, int, float] | None:
+    """Return width, height and scale of an X server's screen. Cached: a server without clients may reset when asked again."""
     if not display:
         return None
     try:
@@ -44,11 +55,19 @@ def _of_x11(display: str | None) -> tuple[int, int] | None:
     except OSError:
         return None
     x11.XOpenDisplay.restype = ctypes.c_void_p
+    x11.XResourceManagerString.restype = ctypes.c_char_p
     connection = x11.XOpenDisplay(None)
     if not connection:
         return None
     server = ctypes.c_void_p(connection)
     screen = x11.XDefaultScreen(server)
-    size = x11.XDisplayWidth(server, screen), x11.XDisplayHeight(server, screen)
+    scale = scale_of(x11.XResourceManagerString(server) or b"")
+    size = x11.XDisplayWidth(server, screen), x11.XDisplayHeight(server, screen), scale
     x11.XCloseDisplay(server)
     return size
+
+
+def scale_of(resources: bytes) -> float:
+    """Return the scale in the resources of an X server, where desktops set it: Xft.dpi, from 96; 1 where it is not there."""
+    found = re.search(rb"^Xft\.dpi:\s*(\d+(\.\d+)?)", resources, re.MULTILINE)
+    return min(max(float(found[1]) / USUAL_DPI, 1.0), MOST_SCALE) if found else 1.0

@@ -18,17 +18,18 @@ from sim.fields import field_of, fill
 PLANE_ROWS, PLANE_COLUMNS = 96, 64
 KEY_LIGHT, FILL_LIGHT, AMBIENT = (0.82, 0.80, 0.77), (0.17, 0.19, 0.23), (0.17, 0.17, 0.19)
 TUMOUR, SUPPORT, EDGE, FRAME = (0.93, 0.76, 0.28), (0.30, 0.33, 0.36), (0.85, 0.9, 0.94), (0.25, 0.77, 1.0)
-PARTS = {"cyst": (0.30, 0.60, 0.86), "urine": (0.62, 0.74, 0.33), "vessel": (0.80, 0.16, 0.20)}
+PARTS = {"cyst": (0.30, 0.60, 0.86), "urine": (0.61, 0.74, 0.38), "vessel": (0.76, 0.16, 0.06)}
 LINE_WIDTH = 1.2
-MASKS = 5
+# Panel, title, strip, compass, findings, warnings, and three groups of the scanner's sliders.
+MASKS = 9
 # Lines of a planned sweep.
 MAX_SEGMENTS = 2000
-TO_GO, DONE = np.array([1.0, 0.72, 0.20], np.float32), np.array([0.30, 0.75, 0.42], np.float32)
+TO_GO, DONE = np.array([1.0, 0.93, 0.17], np.float32), np.array([0.30, 0.75, 0.42], np.float32)
 GOAL = (1.0, 0.86, 0.45)
 PLAN_WIDTH, GOAL_WIDTH = 2.6, 1.8
 SPECIMEN = (0.72, 0.45, 0.38)
 # The score: a line over the capsule, red where it is too near to the tumour, and its marks as small crosses.
-SCORED, NEAR = np.array([0.35, 0.75, 1.0], np.float32), np.array([1.0, 0.25, 0.2], np.float32)
+SCORED, NEAR = np.array([0.61, 0.77, 1.0], np.float32), np.array([0.98, 0.23, 0.18], np.float32)
 MAX_SCORE, MAX_MARKS, MARK_MM, SCORE_LIFT_MM, SCORE_WIDTH = 600, 200, 1.2, 0.6, 3.0
 
 
@@ -130,6 +131,8 @@ class SceneView:
 
     def _mask(self, scene, masked) -> None:
         """Draw quads of alpha 0 just behind the near plane: the background stays visible, what is drawn later is hidden."""
+        if len(masked) > MASKS:
+            raise ValueError(f"{len(masked)} boxes to mask: at most {MASKS} are expected")
         corners = np.full((MASKS, 6, 2), -1.0)
         for quad, box in zip(corners, masked, strict=False):
             # Of left, bottom, right and top: the corners of two triangles.

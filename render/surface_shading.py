@@ -11,7 +11,7 @@ import taichi.math as tm
 
 from sim.fields import array_of, empty_fields, field_of, fields_of, fill, fill_evenly, run_kernel
 
-ORGAN, TINT = (0.66, 0.27, 0.23), (0.24, 0.60, 0.36)
+ORGAN, TINT = (0.66, 0.27, 0.23), (0.27, 0.69, 0.50)
 SOLID, GLASS = 1.0, 0.30
 CUT_EDGE_MM = 0.4
 

@@ -13,8 +13,8 @@ from render.window_layout import WEDGE_WIDTH, Rect, WindowLayout
 PANEL, FINDINGS, LINE = (8, 9, 11), (20, 24, 29), (44, 50, 58)
 TEXT, QUIET = (222, 227, 232), (132, 142, 153)
 MARK, ALERT = (64, 196, 255), (255, 176, 46)
-OUTLINE, OUTLINE_AT_REST, CALIPER = (237, 194, 71), (150, 128, 196), (120, 230, 140)
-RESECTION_LINE = (90, 190, 255)
+OUTLINE, OUTLINE_AT_REST, CALIPER = (237, 194, 71), (146, 121, 187), (151, 248, 154)
+RESECTION_LINE = (88, 188, 254)
 CROSS_PX, NUMBER_PX, NOTE_PX, HINT_PX, FIGURE_PX = 5, 16, 17, 14, 15
 # Legend of the tumour's outlines.
 LEGEND = (("tumour now", OUTLINE), ("in the CT", OUTLINE_AT_REST))
@@ -69,35 +69,41 @@ def draw_note(page: np.ndarray, layout: WindowLayout, box: Rect, note: str) -> N
         write(page, box, (x, y + 1.5 * px(NOTE_PX)), hint, size, QUIET)
 
 
-def draw_segments(page: np.ndarray, view: View, box: Rect, segments_mm: np.ndarray, colour) -> None:
-    """Draw line segments (n, 2, 2) of the plane [mm] over an image, clipped to its box."""
+def draw_segments(
+    page: np.ndarray, view: View, box: Rect, segments_mm: np.ndarray, colour, width: int = 1
+) -> None:
+    """Draw line segments (n, 2, 2) of the plane [mm] over an image, so many pixels wide, clipped to its box."""
     if len(segments_mm) == 0:
         return
     start, end = np.moveaxis(to_pixels(view, box, np.asarray(segments_mm, float)), 1, 0)
     count = int(np.ceil(np.abs(end - start).max())) + 1
     along = np.linspace(0.0, 1.0, count + 1)[:, None, None]
-    column, row = np.floor(start + along * (end - start)).astype(int).reshape(-1, 2).T
+    beside = np.moveaxis(np.indices((width, width)), 0, -1).reshape(-1, 1, 1, 2) - (width - 1) // 2
+    column, row = (np.floor(start + along * (end - start)).astype(int) + beside).reshape(-1, 2).T
     inside = (column >= box.left) & (column < box.right) & (row >= box.top) & (row < box.bottom)
     page[row[inside], column[inside], :3] = colour
 
 
-def draw_caliper(page: np.ndarray, view: View, box: Rect, px: int) -> None:
-    """Draw the caliper: a cross at each of its points, the line between them, and the distance beside it, ``px`` high."""
-    reach = CROSS_PX * np.array([view.width_mm / box.width, view.depth_mm / box.height])
+def draw_caliper(page: np.ndarray, layout: WindowLayout, view: View, box: Rect) -> None:
+    """Draw the caliper: a cross at each of its points, the line between them, and the distance beside it."""
+    px, reach = layout.px(FIGURE_PX), layout.px(CROSS_PX)
+    reach_mm = reach * np.array([view.width_mm / box.width, view.depth_mm / box.height])
     points, figure = np.array(view.caliper_mm, float).reshape(-1, 2), view.caliper
-    crosses = [[point - reach * axis, point + reach * axis] for point in points for axis in np.eye(2)]
+    crosses = [[point - reach_mm * axis, point + reach_mm * axis] for point in points for axis in np.eye(2)]
     line = [points] if len(points) == 2 else []
-    draw_segments(page, view, box, np.array([*crosses, *line]), CALIPER)
+    draw_segments(page, view, box, np.array([*crosses, *line]), CALIPER, layout.line_width)
     if line and figure:
         start, end = to_pixels(view, box, points)
-        write(page, box, beside(start, end, written_size(figure, px), box), figure, px, CALIPER)
+        write(page, box, beside(start, end, written_size(figure, px), box, reach), figure, px, CALIPER)
 
 
-def beside(start: np.ndarray, end: np.ndarray, size: tuple[int, int], box: Rect) -> tuple[float, float]:
-    """Return the centre of a text of a size [pixels] beside a line, on the side towards the centre of the box."""
+def beside(
+    start: np.ndarray, end: np.ndarray, size: tuple[int, int], box: Rect, gap: int
+) -> tuple[float, float]:
+    """Return the centre of a text of a size [pixels] beside a line, ``gap`` away, on the side towards the centre of the box."""
     along = (end - start) / max(float(np.linalg.norm(end - start)), 1.0)
     across = np.array([along[1], -along[0]]) if along.any() else np.array([1.0, 0.0])
-    away = across * (CROSS_PX + np.abs(across) @ size / 2)
+    away = across * (gap + np.abs(across) @ size / 2)
     middle, inner = (start + end) / 2, np.array([box.left + box.width / 2, box.top + box.height / 2])
     x, y = middle + away if away @ (inner - middle) >= 0 else middle - away
     return float(x), float(y)
@@ -121,7 +127,9 @@ def draw_panel(draw: ImageDraw.ImageDraw, layout: WindowLayout, view: View) -> N
         # The marker dot: local +x is to the right.
         x, y, radius = box.right - px(10), box.top - px(12), px(6)
         draw.ellipse([x - radius, y - radius, x + radius, y + radius], fill=MARK)
-        draw.text((box.left, y), name, font=font(px(15)), fill=TEXT, anchor="lm")
+        # An image that is very deep is too narrow for its name.
+        if box.left + font(px(15)).getlength(name) < x - radius:
+            draw.text((box.left, y), name, font=font(px(15)), fill=TEXT, anchor="lm")
 
 
 def status_image(layout: WindowLayout, status: str) -> np.ndarray:
@@ -180,5 +188,9 @@ def _draw_scale(draw: ImageDraw.ImageDraw, layout: WindowLayout, view: View, box
         draw.line([(left, box.top + i), (right, box.top + i)], fill=colour)
     for text, row, anchor in zip(view.scale, (box.top - px(2), box.top + height + px(2)), "ba", strict=True):
         draw.text(
-            (box.right + WEDGE_WIDTH - px(4), row), text, font=font(px(12)), fill=QUIET, anchor=f"r{anchor}"
+            (box.right + px(WEDGE_WIDTH) - px(4), row),
+            text,
+            font=font(px(12)),
+            fill=QUIET,
+            anchor=f"r{anchor}",
         )

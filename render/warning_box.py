@@ -7,26 +7,26 @@ from PIL import Image, ImageDraw
 
 from render.text import font
 from render.ultrasound_panel import ALERT, FINDINGS
-from render.window_layout import FIGURE_HEIGHT, FIGURES_PAD, Rect, WindowLayout
+from render.window_layout import FIGURE_HEIGHT, Rect, WindowLayout
 
 LETTERS_PX = 13
 # The box covers at most this share of the 3D view.
 MOST_SHARE = 0.4
 
 
-def warning_rect(layout: WindowLayout, warnings: tuple[str, ...]) -> Rect | None:
-    """The box of some warnings; None without any."""
+def warning_rect(layout: WindowLayout, warnings: tuple[str, ...], taken: int = 0) -> Rect | None:
+    """The box of some warnings, left of the pixels that are taken at the right; None without any."""
     if not warnings:
         return None
-    room, pitch = layout.foot, layout.px(FIGURE_HEIGHT)
-    height = len(warning_lines(layout, warnings)) * pitch + 2 * FIGURES_PAD
+    room, pitch = _room(layout, taken), layout.px(FIGURE_HEIGHT)
+    height = len(warning_lines(layout, warnings, taken)) * pitch + 2 * layout.figures_pad
     return Rect(room.left, room.bottom - height, room.width, height)
 
 
 @lru_cache(maxsize=8)
-def warning_lines(layout: WindowLayout, warnings: tuple[str, ...]) -> list[str]:
+def warning_lines(layout: WindowLayout, warnings: tuple[str, ...], taken: int = 0) -> list[str]:
     """The lines of some warnings; of very long ones the last lines are left out."""
-    letters, room = font(layout.px(LETTERS_PX)), layout.foot.width - 2 * layout.px(10)
+    letters, room = font(layout.px(LETTERS_PX)), _room(layout, taken).width - 2 * layout.px(10)
     lines: list[str] = []
     for warning in warnings:
         line = ""
@@ -37,20 +37,24 @@ def warning_lines(layout: WindowLayout, warnings: tuple[str, ...]) -> list[str]:
                 longer = word
             line = longer
         lines.append(line)
-    most = max(1, int((MOST_SHARE * layout.scene.height - 2 * FIGURES_PAD) / layout.px(FIGURE_HEIGHT)))
+    most = max(1, int((MOST_SHARE * layout.scene.height - 2 * layout.figures_pad) / layout.px(FIGURE_HEIGHT)))
     return lines if len(lines) <= most else [*lines[: most - 1], "..."]
 
 
 @lru_cache(maxsize=8)
-def warning_image(layout: WindowLayout, warnings: tuple[str, ...]) -> np.ndarray:
+def warning_image(layout: WindowLayout, warnings: tuple[str, ...], taken: int = 0) -> np.ndarray:
     """The box as an image, uint8, shape (height, width, 3). Raises ValueError without a warning."""
-    box = warning_rect(layout, warnings)
+    box = warning_rect(layout, warnings, taken)
     if box is None:
         raise ValueError("expected one warning or more")
     image = Image.new("RGB", (box.width, box.height), FINDINGS)
     draw = ImageDraw.Draw(image)
     draw.rectangle([0, 0, box.width - 1, box.height - 1], outline=ALERT)
-    for place, line in enumerate(warning_lines(layout, warnings)):
-        middle = FIGURES_PAD + (place + 0.5) * layout.px(FIGURE_HEIGHT)
+    for place, line in enumerate(warning_lines(layout, warnings, taken)):
+        middle = layout.figures_pad + (place + 0.5) * layout.px(FIGURE_HEIGHT)
         draw.text((layout.px(10), middle), line, font=font(layout.px(LETTERS_PX)), fill=ALERT, anchor="lm")
     return np.asarray(image)
+
+
+def _room(layout: WindowLayout, taken: int) -> Rect:
+    return layout.foot._replace(width=layout.foot.width - taken)

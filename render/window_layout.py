@@ -1,7 +1,6 @@
 """Layout of the window. Pixels count from the top left; lengths below are those of a window of 1280 x 720."""
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +17,9 @@ FINDINGS_GAP, FINDINGS_WIDTH, FIGURE_HEIGHT, FIGURES_PAD = 10, 178, 20, 7
 COMPASS_SIZE = 92
 # A narrower strip shows no read-outs, so that the labels of its sliders fit.
 STRIP_WITH_READOUTS = 712
-# Texts scale with the window; Dear ImGui's sliders and their boxes do not.
+# Sliders: the height of a row, and the space around the rows of a group.
+ROW_HEIGHT, ROWS_PAD = 23, 7
+# Texts and sliders scale with the window.
 FULL_SIZE, LEAST_SCALE, MOST_SCALE = (1280, 720), 0.8, 4.0
 # How much larger images must be one under the other to be preferred to side by side.
 BELOW_FROM = 1.2
@@ -31,6 +32,10 @@ class Rect(NamedTuple):
     top: int
     width: int
     height: int
+
+    def moved(self, right: int, down: int) -> "Rect":
+        """Return the box elsewhere."""
+        return self._replace(left=self.left + right, top=self.top + down)
 
     @property
     def right(self) -> int:
@@ -68,6 +73,16 @@ class WindowLayout:
         return round(self.scale * pixels)
 
     @property
+    def line_width(self) -> int:
+        """The width of a line over an image [pixels]."""
+        return max(1, self.px(1))
+
+    @property
+    def figures_pad(self) -> int:
+        """The space above and below figures in their box."""
+        return self.px(FIGURES_PAD)
+
+    @property
     def panel(self) -> Rect:
         width = round(self.width * PANEL_SHARE)
         return Rect(self.width - width, 0, width, self.height)
@@ -82,7 +97,7 @@ class WindowLayout:
     @property
     def strip(self) -> Rect:
         """Sliders and read-outs, beneath the 3D view."""
-        height = min(STRIP_HEIGHT, self.height // 3)
+        height = min(self.px(STRIP_HEIGHT), self.height // 3)
         return Rect(0, self.height - height, self.panel.left, height)
 
     @property
@@ -103,7 +118,7 @@ class WindowLayout:
 
     @property
     def readouts(self) -> Rect:
-        width = self.px(READOUT_WIDTH) if self.strip.width >= STRIP_WITH_READOUTS else 0
+        width = self.px(READOUT_WIDTH) if self.strip.width >= self.px(STRIP_WITH_READOUTS) else 0
         return Rect(self.strip.right - width, self.strip.top, width, self.strip.height)
 
     @property
@@ -121,41 +136,50 @@ class WindowLayout:
     @property
     def most_findings(self) -> int:
         """How many lines of findings fit."""
-        room = self.compass.top - 2 * self.px(FINDINGS_GAP) - self.scene.top - 2 * FIGURES_PAD
+        room = self.compass.top - 2 * self.px(FINDINGS_GAP) - self.scene.top - 2 * self.figures_pad
         return max(0, room // self.px(FIGURE_HEIGHT))
 
     def findings(self, count: int) -> Rect:
         """Return the box of this many findings, over the 3D view's upper left corner."""
-        gap, height = self.px(FINDINGS_GAP), count * self.px(FIGURE_HEIGHT) + 2 * FIGURES_PAD
+        gap, height = self.px(FINDINGS_GAP), count * self.px(FIGURE_HEIGHT) + 2 * self.figures_pad
         return Rect(gap, self.scene.top + gap, self.px(FINDINGS_WIDTH), height)
 
     def sliders(self, widths: list[float]) -> list[Rect]:
         """Return boxes for groups of sliders, side by side in the strip, in proportion to `widths`."""
         edges = np.concatenate([[0.0], np.cumsum(widths)]) / sum(widths) * self.slider_room(len(widths))
+        gap = self.px(STRIP_GAP)
         return [
             Rect(
-                round(STRIP_GAP * (i + 1) + edges[i]),
-                self.strip.top + STRIP_GAP,
+                round(gap * (i + 1) + edges[i]),
+                self.strip.top + gap,
                 round(edges[i + 1] - edges[i]),
-                self.strip.height - 2 * STRIP_GAP,
+                self.strip.height - 2 * gap,
             )
             for i in range(len(widths))
         ]
 
     def slider_room(self, count: int) -> int:
         """Return the total width of this many boxes of sliders [pixels]."""
-        return self.readouts.left - STRIP_GAP * (count + 1)
+        return self.readouts.left - self.px(STRIP_GAP) * (count + 1)
 
-    def scanner_sliders(self, heights: list[int]) -> list[Rect]:
-        """Return boxes of the scanner's sliders, one under the other beside the panel, scaled down to fit."""
-        room = self.scene.height - SCANNER_GAP * (len(heights) + 1)
-        share = min(1.0, room / sum(heights))
-        edges = np.concatenate([[0], np.cumsum([int(share * height) + SCANNER_GAP for height in heights])])
-        left, top = self.scene.right - SCANNER_WIDTH, self.scene.top + SCANNER_GAP
-        return [
-            Rect(left, int(top + start), SCANNER_WIDTH - SCANNER_GAP, int(stop - start) - SCANNER_GAP)
-            for start, stop in pairwise(edges)
-        ]
+    def scanner_sliders(self, counts: list[int]) -> list[Rect]:
+        """Return boxes of groups of so many of the scanner's sliders, one under the other beside the panel, lower where many have to fit."""
+        gap, pads = self.px(SCANNER_GAP), 2 * self.slider_pad
+        room = self.scene.height - gap * (len(counts) + 1) - pads * len(counts)
+        pitch = min(self.px(ROW_HEIGHT), room / (sum(counts) + len(counts)))
+        heights = [int(pitch * (count + 1)) + pads for count in counts]
+        tops = self.scene.top + gap + np.cumsum([0, *(height + gap for height in heights[:-1])])
+        left, width = self.scene.right - self.px(SCANNER_WIDTH), self.px(SCANNER_WIDTH) - gap
+        return [Rect(left, int(top), width, height) for top, height in zip(tops, heights, strict=True)]
+
+    def slider_pitch(self, box: Rect, count: int) -> float:
+        """Return the height of a row in the box of so many sliders: there is one more, for their name."""
+        return min(self.px(ROW_HEIGHT), (box.height - 2 * self.slider_pad) / (count + 1))
+
+    @property
+    def slider_pad(self) -> int:
+        """The space around the rows of a group of sliders."""
+        return self.px(ROWS_PAD)
 
     @property
     def whole(self) -> Rect:

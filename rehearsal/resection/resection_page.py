@@ -22,8 +22,8 @@ from scenes.surfaces import signed_distance_from
 
 NAME = "resection"
 # Colours of the margin: in the tumour, then up to each limit, then beyond the last.
-COLOURS = ("#7a0016", "#e5383b", "#f48c06", "#ffd60a", "#52b788")
-CAPSULE = "#c9b8ae"
+COLOURS = ("#7a0016", "#e5383b", "#ef8a00", "#ffd60a", "#52b483")
+CAPSULE = "#d1caca"
 # Views of the specimen along the axes of the score's frame: title, direction from which it is seen, and what is up.
 VIEWS = (("resection surface, from below", (0, 0, -1), (0, 1, 0)), ("from the side", (0, -1, 0), (0, 0, 1)))
 TEXT_WIDTH = 40

@@ -30,13 +30,13 @@ BACKGROUND, WARNING = "#101014", "#ffb000"
 PIXEL_MM = 0.5
 WINDOW_HU, LEVEL_HU = 400.0, 50.0
 COLOUR = {
-    "organ": "#ff8c69",
+    "organ": "#ff8767",
     "tumour": "#ffe14d",
     "cyst": "#4dd2ff",
-    "urine": "#b6ff6b",
-    "sinus": "#ff9df5",
-    "vessel": "#ff3b5c",
-    "support": "#b99cff",
+    "urine": "#bdff85",
+    "sinus": "#d57ec3",
+    "vessel": "#e21b51",
+    "support": "#a090ff",
 }
 WORD = {"organ": "kidney", "urine": "collecting system", "vessel": "vessels"}
 LEAST_BRIGHT = 0.85

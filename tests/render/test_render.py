@@ -4,6 +4,7 @@ import dataclasses
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,9 +15,11 @@ from null_viewer import NullViewer
 from render import background_image, transducer_shape, ultrasound_panel
 from render.camera import OrbitCamera
 from render.cut_face import FLESH
-from render.display import display_available, fitted, window_size
+from render.display import display_available, fitted, scale_of, window_size
+from render.sliders import slider_image
 from render.software_scene import SoftwareScene
 from render.viewer import Controls, Geometry, Settings, View
+from render.warning_box import warning_image, warning_rect
 from render.window_layout import FULL_SIZE, RULER_WIDTH, WindowLayout
 from sim.fields import fill
 
@@ -296,7 +299,9 @@ def test_organ_never_covers_the_panel_the_title_or_the_readouts(window):
     opened.camera.zoom(0.01)
     left, bottom, right, top = opened.camera.part
     opened.camera.pan(0.62 - (left + right) / 2, 0.5 - (bottom + top) / 2)
-    opened.draw(_far_view())
+    warnings = ("Import: check the side of the organ in check.png",)
+    opened.settings.show_scanner = opened.settings.show_resection = True
+    opened.draw(dataclasses.replace(_far_view(), warnings=warnings, findings={"to tumour": "4.2 mm"}))
     picture = opened.picture()
     red = _organ_pixels(picture)
     layout = opened.layout
@@ -306,6 +311,12 @@ def test_organ_never_covers_the_panel_the_title_or_the_readouts(window):
     for rect in (layout.panel, layout.title):
         assert np.array_equal(picture[rect.slices], expected[rect.slices])
     assert np.array_equal(picture[layout.readouts.slices], background_image.readout_image(layout, {}))
+    taken = layout.scene.right - opened._sliders[-1].box.left
+    boxes = [(warning_rect(layout, warnings, taken), warning_image(layout, warnings, taken))]
+    boxes += [(each.box, slider_image(each)) for each in opened._sliders]
+    assert len(boxes) > 4
+    for box, image in boxes:
+        assert np.array_equal(picture[box.slices], image)
 
 
 def test_processor_and_vulkan_draw_the_same_picture(window):
@@ -343,6 +354,120 @@ def test_two_pictures_of_one_view_are_the_same(window):
     opened, _, _ = window
     opened.draw(_view(status="FROZEN"))
     assert np.array_equal(opened.picture(), opened.picture())
+
+
+class Mouse:
+    """Stands for GGUI's window: a mouse at a pixel of a window of 640 x 360, and what was pressed and released since the last frame."""
+
+    running = True
+
+    def __init__(self) -> None:
+        self.at, self.held, self.events = (0.0, 0.0), set(), {"Press": [], "Release": []}
+
+    def goes(self, column: float, row: float) -> None:
+        self.at = column / 640, 1 - row / 360
+
+    def presses(self, key: str) -> None:
+        self.held.add(key)
+        self.events["Press"].append(SimpleNamespace(key=key))
+
+    def releases(self, key: str) -> None:
+        self.held.discard(key)
+        self.events["Release"].append(SimpleNamespace(key=key))
+
+    def get_cursor_pos(self) -> tuple[float, float]:
+        return self.at
+
+    def is_pressed(self, *keys: str) -> bool:
+        return any(key in self.held for key in keys)
+
+    def get_events(self, tag: str) -> list[SimpleNamespace]:
+        found, self.events[tag] = self.events[tag], []
+        return found
+
+
+@pytest.fixture
+def mouse(window, monkeypatch):
+    """The mouse of a visible window, its sliders placed."""
+    opened, _, _ = window
+    opened.draw(_view())
+    opened.picture()
+    mouse = Mouse()
+    with monkeypatch.context() as patch:
+        patch.setattr(opened, "_window", mouse)
+        patch.setattr(opened, "_visible", True)
+        yield mouse
+
+
+def slider_of(opened, name: str):
+    return next(each for shown in opened._sliders for each in shown.sliders if each.name == name)
+
+
+def test_a_slider_follows_the_mouse_slowly_with_shift_until_it_is_let_go(window, mouse):
+    import taichi as ti
+
+    opened, _, _ = window
+    level = slider_of(opened, "level_hu")
+    middle, row = level.track.left + level.track.width / 2, level.track.top + 3
+
+    def now() -> int:
+        opened.read_controls()
+        return opened.settings.level_hu
+
+    mouse.goes(middle, row)
+    before = now()
+    mouse.presses(ti.ui.LMB)
+    assert abs(now()) < 10 and before == 40
+    mouse.goes(middle + level.track.width / 4, 0)
+    assert abs(now() - 250) < 10, "the slider does not follow the mouse beside its row"
+    mouse.presses(ti.ui.SHIFT)
+    mouse.goes(middle, row)
+    assert abs(now() - 225) < 10, "shift does not slow the slider down"
+    mouse.releases(ti.ui.LMB)
+    now()
+    mouse.goes(level.track.left, row)
+    assert abs(now() - 225) < 10, "the slider goes on when it is let go"
+
+
+def test_a_switch_turns_with_each_press_and_none_behind_the_help(window, mouse):
+    import taichi as ti
+
+    opened, _, _ = window
+    track = slider_of(opened, "cut").track
+    mouse.goes(track.left + 2, track.top + 2)
+    seen = []
+    for key in (ti.ui.LMB, ti.ui.LMB, "h", ti.ui.LMB):
+        opened._place_sliders()
+        mouse.presses(key)
+        mouse.releases(key)
+        opened.read_controls()
+        seen.append(opened.settings.cut)
+    assert seen == [True, False, False, False]
+
+
+def test_a_button_that_is_pressed_again_within_a_slow_frame_stays_pressed(window, mouse):
+    import taichi as ti
+
+    opened, _, _ = window
+    mouse.goes(opened.layout.clear.left + 100, opened.layout.clear.top + 60)
+    assert not opened.read_controls().press
+    mouse.presses(ti.ui.LMB)
+    assert opened.read_controls().press
+    mouse.releases(ti.ui.LMB)
+    mouse.presses(ti.ui.LMB)
+    assert opened.read_controls().press
+    mouse.releases(ti.ui.LMB)
+    assert not opened.read_controls().press
+
+
+def test_other_geometry_has_its_own_sliders(window):
+    opened, field, _ = window
+    faces = opened._geometry.organ[1]
+    opened.draw(_view())
+    before = opened.picture()
+    opened.change_geometry(dataclasses.replace(opened._geometry, tumour=(field, faces)))
+    after = opened.picture()
+    assert np.any(before != after, axis=2)[opened.layout.strip.slices].any()
 
 
 @pytest.mark.parametrize(("setting", "value"), [("translucent", True), ("cut", True), ("level_hu", 90)])
@@ -421,10 +546,28 @@ def test_a_missing_display_is_detected(monkeypatch, display):
     ("screen", "size"),
     [
         ((1920, 1080), (1280, 720)),
-        ((3840, 2160), (1280, 720)),
+        ((3840, 2160, 1.0), (1280, 720)),
+        ((3840, 2160, 2.0), (2560, 1440)),
+        ((2880, 1620, 1.5), (1920, 1080)),
+        ((1920, 1080, 2.0), (1664, 936)),
         ((1366, 768), (1152, 648)),
         ((1080, 1920), (1024, 576)),
     ],
 )
 def test_a_window_fits_its_screen(screen, size):
     assert fitted(*screen) == size
+
+
+@pytest.mark.parametrize(
+    ("resources", "scale"),
+    [
+        (b"", 1.0),
+        (b"Xcursor.size:\t24\nXft.dpi:\t192\nXft.rgba:\tnone\n", 2.0),
+        (b"Xft.dpi: 144.0", 1.5),
+        (b"Xft.dpi:\t72\n", 1.0),
+        (b"Xft.dpi: 9600", 4.0),
+        (b"*Xft.dpi.other: 192", 1.0),
+    ],
+)
+def test_the_scale_is_that_of_the_desktop(resources, scale):
+    assert scale_of(resources) == scale

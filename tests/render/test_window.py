@@ -13,7 +13,10 @@ import pytest
 from conftest import ROOT
 from PIL import Image
 
+from render.sliders import Slider, boxes_of
 from render.ultrasound_panel import CALIPER
+from render.viewer import Geometry, Settings
+from render.window_layout import WindowLayout
 
 pytestmark = pytest.mark.skipif(
     not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Xvfb and xdotool"
@@ -119,6 +122,15 @@ class Screen:
         return [path for path in paths if path.read_bytes()[-8:-4] == b"IEND"]
 
 
+def slider(name: str) -> Slider:
+    """A slider of the window."""
+    geometry = Geometry(
+        (None, np.zeros((0, 3))), np.zeros((2, 3)), tumour=(1, 1), parts={"vessel": (1, 1)}, support=(1, 1)
+    )
+    boxes = boxes_of(Settings(young_kpa=15.0), geometry, WindowLayout(*WINDOW))
+    return next(each for shown in boxes for each in shown.sliders if each.name == name)
+
+
 @pytest.fixture
 def screen(tmp_path):
     read, write = os.pipe()
@@ -170,11 +182,20 @@ def test_the_mouse_moves_and_presses_the_transducer(screen):
     green = (measured == CALIPER).all(axis=2)[PANEL]
     assert green.sum() > 100, "two clicks on the B-mode image draw no caliper"
     screen.do("key", "--window", screen.window, "e")
-    exported = screen.out / "001-b-mode.dcm"
+    exported = [screen.out / name for name in ("001-b-mode.dcm", "001-ct.png")]
     end = time.monotonic() + 20
-    while not exported.exists() and time.monotonic() < end:
+    while not all(each.exists() for each in exported) and time.monotonic() < end:
         time.sleep(0.5)
-    assert exported.exists() and (screen.out / "001-ct.png").exists()
+    assert all(each.exists() for each in exported)
+    level = slider("level_hu").track
+    screen.point(level.left + level.width // 2, level.top + level.height // 2)
+    time.sleep(0.5)
+    screen.do("mousedown", 1)
+    screen.point(level.left, level.top + level.height // 2)
+    time.sleep(0.5)
+    screen.do("mouseup", 1)
+    brighter = screen.picture()
+    assert brighter[PANEL].mean() > measured[PANEL].mean() + 10.0, "the slider of the CT changes nothing"
     screen.do("keydown", "Shift_L")
     for place in MARKS:
         screen.point(*place)
@@ -182,8 +203,9 @@ def test_the_mouse_moves_and_presses_the_transducer(screen):
         screen.do("mousedown", 1)
         time.sleep(0.5)
         screen.do("mouseup", 1)
-    screen.do("keyup", "Shift_L")
     screen.picture()
+    # Not before the picture shows the last mark: a slow window would see its click without shift.
+    screen.do("keyup", "Shift_L")
     screen.do("key", "--window", screen.window, "Escape")
     assert screen.program.wait(timeout=20) == 0
     lines = (screen.out / "session-001.jsonl").read_text().splitlines()
