@@ -23,7 +23,7 @@ dask_option = click.option(
 trials_option = click.option(
     "--trials",
     type=WholeRange(MOST_SWEEPS, 100_000),
-    default=36,
+    default=24,
     show_default=True,
     help="Simulated passes of the probe in the search for a plan.",
 )

@@ -51,7 +51,7 @@ class PlanOptions(QualityOptions):
     """Probe, by its name or as a file [the scene's]."""
     speed_mm_s: float = Field(10.0, ge=SLOWEST_MM_S, le=FASTEST_MM_S)
     """Speed of the planned sweep."""
-    trials: int = Field(36, ge=MOST_SWEEPS, le=100_000)
+    trials: int = Field(24, ge=MOST_SWEEPS, le=100_000)
     """Simulated passes of the probe in the search."""
     jobs: int | None = Field(None, ge=1, le=256)
     """Processes [as many as there are processors]."""

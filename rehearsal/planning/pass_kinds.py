@@ -10,7 +10,10 @@ from ultrasound.probe_manipulator import ProbeManipulator
 
 # Directions sampled around the organ; the smallest cosine of one to "above"; the smallest angle between two sides.
 DIRECTIONS, LEAST_COSINE, APART_DEG = 300, 0.1, 20.0
-MOST_PASSES = 6
+# A sweep has at most a few passes; where more are needed side by side, as for a whole kidney, as many, up to the most.
+FEW_PASSES, MOST_PASSES = 4, 6
+# A target that is a single voxel counts as so wide.
+LEAST_MM = 0.1
 # Depth of an unplanned sweep below the settled surface: the middle of the range of a scene's press.
 DEFAULT_DEPTH_MM = 3.0
 # For each parameter its least and greatest value, and those at the beginning of a search. Places are relative to half of the target's
@@ -87,13 +90,21 @@ class PassKind:
         x, y = self.half_mm
         return float(x * cosine + y * sine), float(y * cosine + x * sine)
 
+    @property
+    def most_passes(self) -> int:
+        """The most passes of a sweep."""
+        return max(FEW_PASSES, min(self.needed(0.0), self.needed(90.0)))
+
+    def needed(self, heading_deg: float) -> int:
+        """How many passes of a heading, side by side, cover the width of the target."""
+        return int(np.clip(np.ceil(2 * self.extent_mm(heading_deg)[0] / self.width_mm), 1, MOST_PASSES))
+
     def rows(self) -> list[np.ndarray]:
         """Straight passes side by side over the whole target, in two headings and two numbers: their parameters."""
         middle = {name: (low + high) / 2 for name, (_, _, low, high) in RANGES[self.motion].items()}
         found = []
         for heading in (0.0, 90.0):
-            across = self.extent_mm(heading)[0]
-            count = int(np.clip(np.ceil(2 * across / self.width_mm), 1, MOST_PASSES))
+            across, count = max(self.extent_mm(heading)[0], LEAST_MM), self.needed(heading)
             for number in (count, count + 1):
                 apart = min(self.width_mm / across, 2 / number)
                 for aside in apart * (np.arange(number) - (number - 1) / 2):

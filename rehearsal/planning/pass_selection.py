@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rehearsal.planning.pass_kinds import MOST_PASSES
 from rehearsal.planning.sweep_score import MEANS, WORDING, TriedPass
 
 # About the way of the probe from one pass to the next [mm].
@@ -44,18 +43,18 @@ class PassPool:
         """The score of a set of passes; minus infinity without one."""
         return float(self.scores_with(chosen[1:])[chosen[0]]) if chosen else -np.inf
 
-    def best(self) -> list[int]:
-        """The passes that have the best score together: by adding, exchanging and removing passes while that makes it better."""
+    def best(self, most: int) -> list[int]:
+        """The passes, at most so many, that have the best score together: by adding, exchanging and removing passes while that makes it better."""
         begins = np.argsort(-self.scores_with([]), kind="stable")[:BEGINNINGS]
-        return max((self._improved([int(begin)]) for begin in begins), key=self.score)
+        return max((self._improved([int(begin)], most) for begin in begins), key=self.score)
 
-    def _improved(self, chosen: list[int]) -> list[int]:
+    def _improved(self, chosen: list[int], most: int) -> list[int]:
         """The set after all changes of one pass that make its score better."""
         least = self.score(chosen)
         while True:
             best, changed = least, chosen
             kept = [chosen[:place] + chosen[place + 1 :] for place in range(len(chosen))]
-            for others in [chosen, *kept] if len(chosen) < MOST_PASSES else kept:
+            for others in [chosen, *kept] if len(chosen) < most else kept:
                 scores = self.scores_with(others)
                 for score, some in (
                     (float(scores.max()), [*others, int(scores.argmax())]),
@@ -68,9 +67,9 @@ class PassPool:
             least, chosen = best, changed
 
 
-def best_selection(passes: Sequence[TriedPass]) -> list[TriedPass]:
-    """The passes that have the best score together."""
-    return [passes[number] for number in PassPool(passes).best()] if passes else []
+def best_selection(passes: Sequence[TriedPass], most: int) -> list[TriedPass]:
+    """The passes, at most so many, that have the best score together."""
+    return [passes[number] for number in PassPool(passes).best(most)] if passes else []
 
 
 def score_of(passes: Sequence[TriedPass]) -> float:

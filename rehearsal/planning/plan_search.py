@@ -77,7 +77,7 @@ class PassSearch:
     def add(self, passes: Sequence[TriedPass | None]) -> None:
         """Add tried passes; None is one that the instrument cannot hold."""
         self.tried += [each for each in passes if each is not None]
-        self.best = best_selection(self.tried)
+        self.best = best_selection(self.tried, self.kind.most_passes)
 
 
 # What the processes compute, each with its trial.

@@ -21,7 +21,7 @@ from scenes.anatomy import LoadedAnatomy
 from scenes.scene import with_options
 from ultrasound.target import Target
 
-TRIALS, SPEED_MM_S = 36, 10.0
+TRIALS, SPEED_MM_S = 24, 10.0
 TARGET_NAMES: dict[Target, str] = {
     "margin": "the tumour and its margin",
     "tumour": "the tumour",

@@ -224,6 +224,14 @@ def test_sliding_follows_its_parameters(rehearsal):
     assert beside.poses(manipulator, numbers | dict(aside=1.0)) is None
 
 
+def test_a_sweep_has_few_passes_or_as_many_as_a_wide_target_needs(rehearsal):
+    kind = kind_of(rehearsal, "slide")
+    for half, most in (([5.0, 5.0], 4), ([30.0, 50.0], 4), ([45.0, 39.0], 5), ([900.0, 900.0], MOST_PASSES)):
+        assert replace(kind, half_mm=np.array(half), width_mm=16.0).most_passes == most
+    point = replace(kind, half_mm=np.zeros(2))
+    assert [point.values(each)["aside"] for each in point.rows()] == [0.0, -0.5, 0.5] * 2
+
+
 def test_half_of_the_extent_across_and_along_depends_on_the_heading(rehearsal):
     slide = replace(kind_of(rehearsal, "slide"), half_mm=np.array([7.0, 3.0]))
     assert slide.extent_mm(0.0) == pytest.approx((7, 3)) and slide.extent_mm(-90.0) == pytest.approx((3, 7))

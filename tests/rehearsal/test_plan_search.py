@@ -81,7 +81,7 @@ class Counting:
 
     def on_surrogate(self, kind: PassKind) -> list[TriedPass]:
         rows = [trial_of(kind, each, self.handicaps[kind.side]) for each in kind.rows()]
-        return best_selection(rows) if self.reachable else []
+        return best_selection(rows, kind.most_passes) if self.reachable else []
 
     def tried(self, kind: PassKind, parameters: np.ndarray) -> TriedPass:
         self.passes.append((kind.side, parameters))
@@ -175,7 +175,7 @@ def test_the_surrogate_tries_rows_and_random_passes_and_varies_the_best(monkeypa
     assert len(asked) == plan_search.BEGINNING + plan_search.ROUNDS * plan_search.VARIATIONS
     assert np.array_equal(asked[: len(one.rows())], one.rows())
     tried = [trial_of(one, each) for number, each in enumerate(asked, 1) if number % 5]
-    assert score_of(best) == score_of(best_selection(tried))
+    assert score_of(best) == score_of(best_selection(tried, 4))
 
 
 @pytest.mark.usefixtures("one_device")
