@@ -69,6 +69,7 @@ def plan(asked: PlanOptions) -> None:
         plan_resection(asked)
         return
     out = asked.out
+    click.echo("Reading the patient.")
     loaded, anatomy = load_patient(asked.scene, asked.changes, asked.quality)
     port, scene_probe = trocar_of(loaded.trocar, asked), probe_of(loaded)
     make_place(out, "--out")
@@ -119,6 +120,8 @@ def plan_resection(asked: PlanOptions) -> None:
 
 def table_of(proposals: list["Proposal"]) -> str:
     """The proposals with their main figures, for the terminal."""
+    from rehearsal.resection.judgement import NOT_LABELLED
+
     heads = [
         "technique",
         "cost, ml",
@@ -134,11 +137,11 @@ def table_of(proposals: list["Proposal"]) -> str:
             each.judgement.margin.margin_mm.min(),
             each.judgement.parenchyma_removed_ml,
             each.judgement.collecting_system_opened_mm2,
-            len(each.judgement.vessels),
+            None if each.judgement.vessels is None else len(each.judgement.vessels),
         ]
         for each in proposals
     ]
-    return tabulate(rows, heads, floatfmt=".1f")
+    return tabulate(rows, heads, floatfmt=".1f", missingval=NOT_LABELLED)
 
 
 def rehearse_command_line(scene: Path, plan_file: Path, probe: str | None) -> str:

@@ -24,6 +24,8 @@ MARGIN_LIMITS_MM = (1.0, 3.0, 5.0)
 # Parts of an organ that are not parenchyma.
 NOT_PARENCHYMA = ("tumour", "cyst", "urine", "vessel", "sinus")
 VESSELS = ("artery", "vein", "vessel")
+# Of a collecting system or vessels that nobody has outlined: that none was opened cannot be said.
+NOT_LABELLED = "not labelled"
 # Segmental vessels are narrower.
 MAIN_VESSEL_MM = 5.0
 # A cut that is no farther inside a surface runs along it.
@@ -72,7 +74,7 @@ class MarginMap:
 class Judgement:
     """The figures of a cut. ``margin`` in the undeformed patient, ``margin_as_cut`` in the tissue as it was when it was cut.
 
-    ``volume_change_percent`` is that of organ and specimen together, in the tissue as cut.
+    The collecting system and the vessels are None where the patient has none labelled. ``volume_change_percent`` is that of organ and specimen together, in the tissue as cut.
     """
 
     margin: MarginMap
@@ -81,8 +83,8 @@ class Judgement:
     tumour_left_ml: float
     parenchyma_removed_ml: float
     parenchyma_removed_percent: float
-    collecting_system_opened_mm2: float
-    vessels: tuple[DividedVessel, ...]
+    collecting_system_opened_mm2: float | None
+    vessels: tuple[DividedVessel, ...] | None
     volume_change_percent: float
 
     def warnings(self) -> list[str]:
@@ -92,7 +94,7 @@ class Judgement:
             found.append(
                 f"the cut goes through the tumour over {self.margin.positive_mm2:.0f} mm2; {self.tumour_left_ml:.1f} ml of it are left"
             )
-        wide = [vessel for vessel in self.vessels if vessel.diameter_mm >= MAIN_VESSEL_MM]
+        wide = [vessel for vessel in self.vessels or () if vessel.diameter_mm >= MAIN_VESSEL_MM]
         if wide:
             found.append(
                 f"the cut divides a {wide[0].tissue} of {wide[0].diameter_mm:.1f} mm, as wide as a main vessel"
@@ -101,7 +103,7 @@ class Judgement:
 
     def report(self) -> dict:
         """The figures for ``report.json``."""
-        margin = self.margin
+        margin, opened, vessels = self.margin, self.collecting_system_opened_mm2, self.vessels
         return dict(
             margin_min_mm=round(float(margin.margin_mm.min()), 2),
             margin_mean_mm=round(margin.mean_mm, 2),
@@ -116,8 +118,10 @@ class Judgement:
             specimen_ml=round(float(self.specimen_ml), 3),
             parenchyma_removed_ml=round(self.parenchyma_removed_ml, 3),
             parenchyma_removed_percent=round(self.parenchyma_removed_percent, 2),
-            collecting_system_opened_mm2=round(self.collecting_system_opened_mm2, 1),
-            vessels=[dict(tissue=v.tissue, diameter_mm=round(v.diameter_mm, 1)) for v in self.vessels],
+            collecting_system_opened_mm2=None if opened is None else round(opened, 1),
+            vessels=None
+            if vessels is None
+            else [dict(tissue=v.tissue, diameter_mm=round(v.diameter_mm, 1)) for v in vessels],
             bed_mm2=round(float(margin.area_mm2.sum()), 1),
             volume_change_percent=round(self.volume_change_percent, 3),
         )
@@ -192,10 +196,10 @@ def _parenchyma_ml(
     return removed / 1000, (healthy.volume() - removed) / 1000
 
 
-def _opened_mm2(surface: trimesh.Trimesh, part: trimesh.Trimesh | None) -> float:
-    """Area [mm^2] of a surface inside a part."""
+def _opened_mm2(surface: trimesh.Trimesh, part: trimesh.Trimesh | None) -> float | None:
+    """Area [mm^2] of a surface inside a part, if there is one."""
     if part is None:
-        return 0.0
+        return None
     inside = signed_distance_from(part, surface.triangles_center) < 0
     area = float(surface.area_faces[inside].sum())
     return area if area >= LEAST_OPENED_MM2 else 0.0
@@ -206,10 +210,10 @@ def divided_vessels(
     vessels: trimesh.Trimesh | None,
     labels: Grid | None,
     tissues: Mapping[int, str],
-) -> tuple[DividedVessel, ...]:
-    """The vessels that a surface of small faces divides, the widest first; by ``labels`` they are arteries or veins."""
+) -> tuple[DividedVessel, ...] | None:
+    """The vessels that a surface of small faces divides, if there are any, the widest first; by ``labels`` they are arteries or veins."""
     if vessels is None:
-        return ()
+        return None
     middle, area = surface.triangles_center, surface.area_faces
     inside = np.flatnonzero(signed_distance_from(vessels, middle) < 0)
     if len(inside) == 0:
@@ -250,15 +254,17 @@ def _vessel_at(points: np.ndarray, labels: Grid | None, tissues: Mapping[int, st
 
 def findings_of(judgement: Judgement) -> dict[str, str]:
     """Name -> figure with its unit, of a cut, for the window."""
-    margin = judgement.margin
+    margin, opened = judgement.margin, judgement.collecting_system_opened_mm2
     found = {
         "least margin": f"{margin.margin_mm.min():.1f} mm",
         "positive margin": f"{margin.positive_mm2:.0f} mm2",
         "specimen": f"{judgement.specimen_ml:.1f} ml",
         "parenchyma": f"-{judgement.parenchyma_removed_ml:.1f} ml ({judgement.parenchyma_removed_percent:.1f} %)",
-        "calyces opened": f"{judgement.collecting_system_opened_mm2:.0f} mm2",
+        "calyces opened": NOT_LABELLED if opened is None else f"{opened:.0f} mm2",
     }
-    if judgement.vessels:
+    if judgement.vessels is None:
+        found["vessels cut"] = NOT_LABELLED
+    elif judgement.vessels:
         widest = judgement.vessels[0]
         found["vessels cut"] = f"{len(judgement.vessels)}, {widest.tissue} {widest.diameter_mm:.1f} mm"
     return found

@@ -92,8 +92,8 @@ class Proposal:
 
 def cost_ml(judgement: Judgement, margin_mm: float) -> float:
     """Parenchyma removed [ml]; an opened collecting system, divided vessels, and margin that is missing count as so many ml more."""
-    opened = OPENED_ML_MM2 * judgement.collecting_system_opened_mm2
-    vessels = VESSEL_ML_MM2 * sum(np.pi / 4 * vessel.diameter_mm**2 for vessel in judgement.vessels)
+    opened = OPENED_ML_MM2 * (judgement.collecting_system_opened_mm2 or 0.0)
+    vessels = VESSEL_ML_MM2 * sum(np.pi / 4 * vessel.diameter_mm**2 for vessel in judgement.vessels or ())
     missing = max(margin_mm - float(judgement.margin.margin_mm.min()) - KEPT_WITHIN_MM, 0.0)
     left = LEFT_ML_MM2 * judgement.margin.positive_mm2
     return judgement.parenchyma_removed_ml + opened + vessels + MISSING_ML_MM * missing + left

@@ -14,7 +14,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.cut import Cut
-from rehearsal.resection.judgement import MARGIN_LIMITS_MM, Judgement
+from rehearsal.resection.judgement import MARGIN_LIMITS_MM, NOT_LABELLED, Judgement
 from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.score_line import ResectionError
 from rehearsal.result_files import counted, save_figure, write_json
@@ -151,7 +151,8 @@ def _draw_figures(figure: Figure, report: dict[str, Any]) -> float:
 def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
     """Names and values of a report, for the page and the terminal."""
     depth = "as deep as seen" if report["depth_mm"] is None else f"{report['depth_mm']:g} mm deep"
-    vessels = [f"{each['tissue']} {each['diameter_mm']:.1f} mm" for each in report["vessels"]]
+    opened, divided = report["collecting_system_opened_mm2"], report["vessels"]
+    vessels = [f"{each['tissue']} {each['diameter_mm']:.1f} mm" for each in divided or []]
     shown = ", ".join(vessels[:3]) + (f" and {len(vessels) - 3} more" if len(vessels) > 3 else "")
     below = ", ".join(f"{report[f'margin_below_{limit:g}_mm2']:.0f}" for limit in MARGIN_LIMITS_MM)
     limits = ", ".join(f"{limit:g}" for limit in MARGIN_LIMITS_MM)
@@ -187,8 +188,8 @@ def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
             "parenchyma removed",
             f"{report['parenchyma_removed_ml']:.1f} ml, {report['parenchyma_removed_percent']:.1f} % of the kidney",
         ),
-        ("collecting system", f"{report['collecting_system_opened_mm2']:.0f} mm2 opened"),
-        ("vessels cut", shown or "none"),
+        ("collecting system", NOT_LABELLED if opened is None else f"{opened:.0f} mm2 opened"),
+        ("vessels cut", NOT_LABELLED if divided is None else shown or "none"),
         ("bed", f"{report['bed_mm2'] / 100:.1f} cm2"),
         *against,
         *([("import", f"{counted(warnings, 'warning')} not acknowledged")] if warnings else []),

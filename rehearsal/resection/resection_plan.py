@@ -52,7 +52,7 @@ class PlannedCut(_FileModel):
     @classmethod
     def _check_compared(cls, figures: dict[str, JsonValue]) -> dict[str, JsonValue]:
         for name in COMPARED:
-            if not isinstance(figures.get(name), int | float):
+            if not isinstance(figures.get(name, ""), int | float | None):
                 raise ValueError(f"{name} is no number")
         return figures
 
@@ -83,8 +83,13 @@ class ResectionPlan(_FileModel):
             planned_technique=planned.technique,
             planned_cost_ml=round(planned.cost_ml, 2),
             cost_ml=round(cost_ml(judgement, self.margin_mm), 2),
-            **{f"{name}_more": round(made[name] - float(figures[name]), 3) for name in COMPARED},  # type: ignore[arg-type]
+            **{f"{name}_more": _more(made[name], figures[name]) for name in COMPARED},
         )
+
+
+def _more(made: float | None, planned: JsonValue) -> float | None:
+    """How much more was made than planned; None for what is not labelled."""
+    return round(made - planned, 3) if made is not None and isinstance(planned, int | float) else None
 
 
 def planned_cut(proposal: Proposal, origin: np.ndarray) -> PlannedCut:

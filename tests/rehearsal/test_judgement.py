@@ -9,12 +9,15 @@ from cut_ball import R, ball, cap_mm3, cut_by, half_space, inset
 from rehearsal.resection.judgement import (
     FACE_MM,
     LEAST_OPENED_MM2,
+    NOT_LABELLED,
     Carried,
     Judgement,
     diameter_of_section,
     divided_vessels,
+    findings_of,
     judge,
 )
+from rehearsal.resection.proposal import cost_ml
 from scenes.anatomy import Grid
 
 ORGAN = ball(R)
@@ -93,9 +96,19 @@ def test_specimen_and_parenchyma_are_what_is_above_the_plane():
 
 
 def test_a_part_that_the_cut_does_not_reach_is_not_opened():
-    urine = ball(5.0, (0.0, 0.0, -10.0))
-    found = judged(cut_by(ORGAN, half_space(6.0)), ball(6.0, (0.0, 0.0, 15.0)), dict(urine=urine))
+    below = ball(5.0, (0.0, 0.0, -10.0))
+    cut, tumour = cut_by(ORGAN, half_space(6.0)), ball(6.0, (0.0, 0.0, 15.0))
+    found = judged(cut, tumour, dict(urine=below, vessel=below))
     assert found.collecting_system_opened_mm2 == 0 and found.vessels == ()
+    assert "vessels cut" not in findings_of(found)
+
+
+def test_what_is_not_labelled_is_not_said_to_be_whole():
+    found = judged(cut_by(ORGAN, half_space(6.0)), ball(6.0, (0.0, 0.0, 15.0)))
+    report, shown = found.report(), findings_of(found)
+    assert report["collecting_system_opened_mm2"] is report["vessels"] is None
+    assert shown["calyces opened"] == shown["vessels cut"] == NOT_LABELLED
+    assert cost_ml(found, 0.0) == pytest.approx(found.parenchyma_removed_ml)
 
 
 def test_figures_as_cut_are_those_of_the_tissue_then():

@@ -85,7 +85,7 @@ def told(*line: object) -> list[str]:
 def test_processes_and_a_cluster_write_the_same_bytes(made):
     assert (made.folder / "plan.json").read_bytes() == (made.folder / "again.json").read_bytes()
     assert sum(sweep.trials for sweep in made.plan.sweeps) == TRIALS
-    *why, wrote = made.said
+    _, *why, wrote = made.said
     assert why == made.plan.why and wrote.startswith(f"Wrote {len(made.plan.sweeps)} sweeps to ")
     assert made.plan.trocar.at_mm == (0.0, -150.0, 200.0)
     assert made.plan.model["cell_mm"] == 8.0 and (made.plan.target, made.plan.margin_mm) == ("margin", 5.0)
