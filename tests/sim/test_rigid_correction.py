@@ -7,9 +7,10 @@ import trimesh
 from conftest import rotation_about
 
 from sim.body import Body, BodyState
-from sim.fields import array_of, fill
+from sim.fields import array_of, field_of, fill
 from sim.lattice import fill_with_cells
 from sim.neo_hookean import NeoHookean
+from sim.rigid_correction import RigidCorrection
 
 DT = 1 / 60
 
@@ -41,3 +42,38 @@ def test_any_rigid_way_is_found_whole(kept, serial, spin):
     begin(model, DT)
     # However it moved before. Places of up to 25 mm carry 2e-6 mm in float32, and a turn of as many digits has them for its lever.
     assert np.abs(array_of(model.body.predicted) - wanted).max() < 1.2e-5
+
+
+@ti.kernel
+def move(rigid: ti.template(), dt: float):
+    rigid.move(dt)
+
+
+def nearest_rigid_motion(x: np.ndarray, wanted: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Where a rigid motion of places (n, 3) brings them nearest to others, by weighted squares (Kabsch 1976)."""
+    middles = [weight @ places / weight.sum() for places in (x, wanted)]
+    u, _, vt = np.linalg.svd((weight[:, None] * (x - middles[0])).T @ (wanted - middles[1]))
+    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return (x - middles[0]) @ turn + middles[1]
+
+
+@pytest.mark.parametrize("serial", [True, False])
+def test_nodes_are_held_by_their_inertia_and_by_tethers(one_device, serial):
+    random = np.random.default_rng(4)
+    x, mass, tether = (
+        random.normal(0, 15, (200, 3)),
+        random.uniform(0.5, 2, 200),
+        random.uniform(0, 4000, 200),
+    )
+    body = Body(x + random.normal(0, 1.0, x.shape))
+    inertia = mass / DT**2
+    target = x + random.normal(0, 1.0, x.shape)
+    rigid = RigidCorrection(body, field_of(mass), field_of(target, 1), None, serial, field_of(tether))
+    body.restore(BodyState(x.astype(np.float32), np.zeros((200, 3), np.float32)))
+    move(rigid, DT)
+    held = inertia[:, None] * target + tether[:, None] * body.rest_points
+    wanted = nearest_rigid_motion(x, held / (inertia + tether)[:, None], inertia + tether)
+    # Without the tethers, or with those alone, it would be elsewhere.
+    assert np.abs(wanted - nearest_rigid_motion(x, target, inertia)).max() > 0.02
+    # As above; sums over 200 nodes at 15 mm add some digits.
+    assert np.abs(array_of(body.predicted) - wanted).max() < 3e-5
