@@ -1,4 +1,4 @@
-"""The image behind the 3D view: ultrasound panel, title, clock, help, sliders, read-outs, findings and compass. Images are uint8 (height, width, 3).
+"""The image behind the 3D view: ultrasound panel, title, clock, help, read-outs, findings and compass. Images are uint8 (height, width, 3).
 
 Each frame redraws only what changed.
 """
@@ -11,7 +11,6 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from render.keys import Keys
-from render.sliders import SliderBox, slider_image
 from render.text import fitting_size, font, shortened
 from render.ultrasound_panel import (
     ALERT,
@@ -70,7 +69,7 @@ class BackgroundImage:
         # The same memory as rows, top down, for drawing.
         self._rows = self.pixels.transpose(1, 0, 2)[::-1]
         self._view: View | None = None
-        self._sliders: tuple[SliderBox, ...] = ()
+        self._taken = 0
         self._backdrop: tuple = ()
         self.has_scene = self._shows_help = False
         self._axes: np.ndarray | None = None
@@ -82,11 +81,12 @@ class BackgroundImage:
         self,
         view: View,
         axes: np.ndarray,
-        sliders: tuple[SliderBox, ...] = (),
+        taken: int = 0,
         slow_figures: bool = False,
     ) -> None:
-        """Draw a view and sliders, with the compass for a camera's axes (3, 3): right, up and ahead, in patient coordinates.
+        """Draw a view, with the compass for a camera's axes (3, 3): right, up and ahead, in patient coordinates.
 
+        Sliders beside the warnings have ``taken`` so many pixels at the right of the 3D view.
         With ``slow_figures``, figures change only every READOUT_PERIOD_S, so that they can be read.
         """
         findings = first_of(view.findings, self.layout.most_findings)
@@ -100,14 +100,13 @@ class BackgroundImage:
             view.title,
             len(findings),
             view.warnings,
-            tuple(each.box for each in sliders),
+            taken,
         )
         if self._shows_help or self._backdrop != parts:
             self._rows[:, :, :3] = backdrop(self.layout, view, self.keys.of["help"])
             self._figures, self._axes, self._status, self._shows_help = None, None, None, False
-            self._sliders = ()
             self._empty_scene, self.has_scene = self._scene.copy(), False
-        self._view, self._backdrop = view, parts
+        self._view, self._backdrop, self._taken = view, parts, taken
         for (name, image), box in zip(view.shown.items(), image_boxes(self.layout, view), strict=True):
             paste_image(self._rows, box, image)
             self._draw_over(view, name, box)
@@ -119,10 +118,6 @@ class BackgroundImage:
         if self._axes is None or not np.array_equal(axes, self._axes):
             self._put(self.layout.compass, compass_image(self.layout, axes))
             self._axes = axes
-        for each in sliders:
-            if each not in self._sliders:
-                self._put(each.box, slider_image(each))
-        self._sliders = sliders
         if (warned := self._warning_rect(view)) is not None:
             self._put(warned, warning_image(self.layout, view.warnings, self._taken))
 
@@ -137,23 +132,14 @@ class BackgroundImage:
         self.has_scene = True
 
     def boxes_over_scene(self, view: View) -> list[Rect]:
-        """The boxes that cover the 3D view: compass, findings, warnings, the scanner's sliders."""
+        """The boxes that cover the 3D view: compass, findings, warnings."""
         count = min(len(view.findings), self.layout.most_findings)
         findings = self.layout.findings(count) if count else None
-        sliders = [each.box for each in self._sliders if each.is_over_scene]
-        boxes = self.layout.compass, findings, self._warning_rect(view), *sliders
+        boxes = self.layout.compass, findings, self._warning_rect(view)
         return [box for box in boxes if box is not None]
 
     def _warning_rect(self, view: View) -> Rect | None:
         return warning_rect(self.layout, view.warnings, self._taken)
-
-    @property
-    def _taken(self) -> int:
-        """The width that the scanner's sliders take at the right of the 3D view."""
-        return max(
-            (self.layout.scene.right - each.box.left for each in self._sliders if each.is_over_scene),
-            default=0,
-        )
 
     @property
     def _scene(self) -> np.ndarray:

@@ -10,8 +10,6 @@ from render.ultrasound_panel import ALERT, FINDINGS
 from render.window_layout import FIGURE_HEIGHT, Rect, WindowLayout
 
 LETTERS_PX = 13
-# The box covers at most this share of the 3D view.
-MOST_SHARE = 0.4
 
 
 def warning_rect(layout: WindowLayout, warnings: tuple[str, ...], taken: int = 0) -> Rect | None:
@@ -37,7 +35,9 @@ def warning_lines(layout: WindowLayout, warnings: tuple[str, ...], taken: int = 
                 longer = word
             line = longer
         lines.append(line)
-    most = max(1, int((MOST_SHARE * layout.scene.height - 2 * layout.figures_pad) / layout.px(FIGURE_HEIGHT)))
+    most = max(
+        1, (layout.foot.bottom - layout.highest_warning - 2 * layout.figures_pad) // layout.px(FIGURE_HEIGHT)
+    )
     return lines if len(lines) <= most else [*lines[: most - 1], "..."]
 
 

@@ -1,15 +1,17 @@
 """The window, on a screen or off-screen: 3D view, ultrasound panel, sliders, mouse and keys.
 
 The only file that imports taichi.ui. A frame is drawn in this order:
-1. a full-window background image (background_image.py): panel, images, texts, sliders; where no graphics card draws, the 3D view too
+1. a full-window background image (background_image.py): panel, images, texts; where no graphics card draws, the 3D view too
    (software_scene.py);
 2. elsewhere, invisible quads near the camera, over the panel and the strip, which fill the depth buffer there, so that no organ covers them;
-3. support, transducer, image plane, tumour, and last the organ, whose faces may be translucent.
+3. support, transducer, image plane, tumour, and last the organ, whose faces may be translucent;
+4. the sliders, from the metadata of `Settings`.
 """
 
 import atexit
 import dataclasses
 import time
+from collections import Counter
 from functools import partial
 from pathlib import Path
 
@@ -23,15 +25,17 @@ from render.display import display_available
 from render.gamepad import Gamepad
 from render.keys import Keys, begin, hold
 from render.scene_view import SceneView
-from render.sliders import FINE, Slider, SliderBox, boxes_of, slider_at
+from render.sliders import boxes_of, draw_sliders
 from render.software_scene import SoftwareScene
-from render.viewer import Controls, Geometry, Settings, View
+from render.viewer import SCANNER_GROUPS, Controls, Geometry, Settings, View
 from render.vulkan_device import draws_by_processor
 from render.window_layout import FULL_SIZE, Rect, WindowLayout
 from sim.device import on_cpu
 from sim.fields import FieldSet
 
 ZOOM_S = 0.5
+# How far beside a box of sliders the mouse still takes its edge [pixels], and how far it goes in a drag, in shares of the window.
+BOX_EDGE_PX, DRAG = 4, 0.002
 ZOOM_SENSE = {"zoom_in": -1.0, "zoom_out": 1.0}
 FRAMES_A_SECOND = 60
 # Where a frame takes longer than the first, the processor draws the 3D view only this often.
@@ -75,6 +79,8 @@ class Window:
             raise RuntimeError("no display to open a window on")
         self.keys, self._gamepad = keys or Keys(), gamepad
         self.layout = WindowLayout(*size)
+        # GGUI measures sliders in fractions of the size that the window was opened with.
+        self._first_size = size
         self._visible = visible
         self._ini_was_there = Path("imgui.ini").exists()
         try:
@@ -85,6 +91,7 @@ class Window:
             raise NoVulkan("no Vulkan driver found: the window and its pictures need one") from error
         atexit.register(self.close)
         self._canvas, self._scene = self._window.get_canvas(), self._window.get_scene()
+        self._gui = self._window.get_gui()
         self._view: View | None = None
         self._quit = False
         self._help_shown = False
@@ -92,11 +99,11 @@ class Window:
         self._drag: str | None = None
         self._cursor: np.ndarray | None = None
         self._pressing = False
-        self._sliders: tuple[SliderBox, ...] = ()
-        self._sliders_of: tuple[object, ...] = ()
-        # The slider that the mouse moves, and where on its track it is.
-        self._moved_slider: Slider | None = None
-        self._slider_share = 0.0
+        # The boxes of sliders by group, and how often the user moved each.
+        self._slider_boxes: dict[str, Rect] = {}
+        self._boxes_moved: Counter[str] = Counter()
+        # Groups under a press, where it was, and the settings then.
+        self._before_drag: tuple[list[str], np.ndarray, tuple] | None = None
         self._last_read = time.perf_counter()
         self._ui_camera = ti.ui.Camera()
         self._background = BackgroundImage(self.layout, self.keys)
@@ -107,7 +114,6 @@ class Window:
     def show_scene(self, geometry: Geometry, settings: Settings | None = None) -> None:
         """Show a scene from now on, with these values of the sliders."""
         self.settings, self._geometry = settings or Settings(), geometry
-        self._sliders_of = ()
         part, size = (
             self.layout.window_coordinates(self.layout.clear),
             (self.layout.width, self.layout.height),
@@ -124,7 +130,6 @@ class Window:
     def change_geometry(self, geometry: Geometry) -> None:
         """Show other surfaces from now on, with camera and settings as they are."""
         self._geometry, before = geometry, self._scene_fields
-        self._sliders_of = ()
         with FieldSet() as self._scene_fields:
             self._scene_view = SceneView(geometry, self.camera, self._scene_view)
         before.free()
@@ -155,9 +160,6 @@ class Window:
         if not self._visible:
             return controls
         self._read_cursor()
-        # Before the events: a slider that is pressed now jumps to where the mouse is by now, and one that is let go was moved until now.
-        if self._moved_slider is not None:
-            self._move_slider(self._moved_slider)
         self._read_events(controls)
         for action in (action for action, key in self.keys.held() if self._window.is_pressed(key)):
             hold(action, controls, elapsed)
@@ -187,9 +189,8 @@ class Window:
         if self._cursor is None:
             return False
         place = self._pixel(self._cursor)
-        return self.layout.scene.contains(*place) and not any(
-            box.contains(*place) for box in self._boxes_over_scene()
-        )
+        over = [*self._boxes_over_scene(), *self._slider_boxes.values()]
+        return self.layout.scene.contains(*place) and not any(box.contains(*place) for box in over)
 
     def _boxes_over_scene(self) -> list[Rect]:
         """Return the boxes of the background image that cover the 3D view."""
@@ -211,7 +212,8 @@ class Window:
             if self._window.is_pressed(event.key):
                 continue
             if event.key == ti.ui.LMB:
-                self._pressing, self._moved_slider = False, None
+                self._pressing = False
+                self._restore_sliders()
             elif event.key in (ti.ui.RMB, ti.ui.MMB):
                 self._drag = None
 
@@ -224,7 +226,9 @@ class Window:
             if self._cursor is not None and not self._help_shown:
                 place = self._pixel(self._cursor)
                 controls.pointed_mm = self._background.plane_point_at(*place)
-                self._press_slider(slider_at(self._sliders, *place))
+                boxes = self._slider_boxes.items()
+                pressed = [name for name, box in boxes if box.widened(BOX_EDGE_PX).contains(*place)]
+                self._before_drag = pressed, self._cursor, dataclasses.astuple(self.settings)
         elif key in (ti.ui.RMB, ti.ui.MMB) and self._over_scene():
             pans = key == ti.ui.MMB or with_shift
             self._drag = "pan" if pans else "orbit"
@@ -233,21 +237,14 @@ class Window:
         else:
             begin(action, controls)
 
-    def _press_slider(self, slider: Slider | None) -> None:
-        """Turn a switch, or take a slider by its handle, which jumps to the mouse."""
-        if slider is not None and slider.is_switch:
-            setattr(self.settings, slider.name, not slider.value)
-        elif slider is not None and self._cursor is not None:
-            column, _ = self._pixel(self._cursor)
-            self._moved_slider, self._slider_share = slider, (column - slider.track.left) / slider.track.width
-            setattr(self.settings, slider.name, slider.value_at(self._slider_share))
-
-    def _move_slider(self, slider: Slider) -> None:
-        """Let the handle follow the mouse; with shift held, slowly."""
-        way = self._moved[0] * self.layout.width / slider.track.width
-        if way:
-            self._slider_share += FINE * way if self._window.is_pressed(ti.ui.SHIFT) else way
-            setattr(self.settings, slider.name, slider.value_at(self._slider_share))
+    def _restore_sliders(self) -> None:
+        """After a drag that may have moved a box of sliders, have a new one: GGUI cannot move a box."""
+        before_drag, self._before_drag = self._before_drag, None
+        if before_drag is None or self._cursor is None:
+            return
+        pressed, cursor, settings = before_drag
+        if np.abs(self._cursor - cursor).max() > DRAG and settings == dataclasses.astuple(self.settings):
+            self._boxes_moved.update(pressed)
 
     # Drawing
 
@@ -275,8 +272,9 @@ class Window:
         """Return the last view drawn, uint8, shape (height, width, 3). Raises RuntimeError if nothing was drawn."""
         if self._view is None:
             raise RuntimeError("nothing was drawn yet")
-        # In the first frames of some drivers a body may be missing.
-        while not self._visible and self._software is None and self._warm_up > 0:
+        self._place_sliders()
+        # Dear ImGui shows a new box one frame late, and in the first frames of some drivers a body may be missing.
+        while not self._visible and self._warm_up > 0:
             self._warm_up -= 1
             self._draw_frame(self._view)
             self._window.get_image_buffer_as_numpy()
@@ -292,7 +290,7 @@ class Window:
         if self._window is None:
             return
         window, self._window, self._quit = self._window, None, True
-        self._canvas = self._scene = None
+        self._canvas = self._scene = self._gui = None
         window.destroy()
         # Dear ImGui writes its layout file into the working directory; GGUI has no option against it.
         if not self._ini_was_there:
@@ -315,7 +313,7 @@ class Window:
             self._background.show_help()
         else:
             self._place_sliders()
-            self._background.compose(view, np.stack(self.camera.axes()), self._sliders, self._visible)
+            self._background.compose(view, np.stack(self.camera.axes()), self._taken(), self._visible)
             keeps = self._is_ahead or self._keeps_scene()
             if self._software is not None and not (keeps and self._background.has_scene):
                 self._draw_by_processor(self._software, view)
@@ -323,12 +321,21 @@ class Window:
         self._put_image()
         if self._software is None:
             self._draw_scene(view)
+        if not self._help_shown:
+            placed = self._slider_boxes, self._first_size, self._boxes_moved
+            draw_sliders(self._gui, self.settings, self._geometry, *placed)
 
     def _place_sliders(self) -> None:
-        """Have the sliders of the present settings."""
-        of = self.layout, *vars(self.settings).values()
-        if of != self._sliders_of:
-            self._sliders, self._sliders_of = boxes_of(self.settings, self._geometry, self.layout), of
+        """Have the boxes of the present settings."""
+        boxes = boxes_of(self.settings, self._geometry, self.layout)
+        if boxes != self._slider_boxes:
+            self._slider_boxes, self._warm_up = boxes, 2
+
+    def _taken(self) -> int:
+        """The width that the scanner's sliders take beside the warnings."""
+        scene, warned = self.layout.scene, self.layout.highest_warning
+        boxes = [box for name, box in self._slider_boxes.items() if name in SCANNER_GROUPS]
+        return max((scene.right - box.left for box in boxes if box.bottom > warned), default=0)
 
     def _put_image(self) -> None:
         # Without the 10 ms that Canvas.set_image needs to pack the pixels.

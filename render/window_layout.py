@@ -12,14 +12,14 @@ STRIP_HEIGHT, STRIP_GAP, READOUT_WIDTH = 184, 4, 134
 HEADER_HEIGHT, FOOTER_HEIGHT = 74, 52
 STATUS_MIDDLE, STATUS_HEIGHT = 43, 18
 RULER_WIDTH, WEDGE_WIDTH, IMAGE_GAP, NAME_HEIGHT = 42, 30, 10, 26
-SCANNER_WIDTH, SCANNER_GAP = 196, 6
+SCANNER_GAP = 6
 FINDINGS_GAP, FINDINGS_WIDTH, FIGURE_HEIGHT, FIGURES_PAD = 10, 178, 20, 7
 COMPASS_SIZE = 92
+# Warnings cover at most this share of the 3D view.
+MOST_WARNED = 0.4
 # A narrower strip shows no read-outs, so that the labels of its sliders fit.
 STRIP_WITH_READOUTS = 712
-# Sliders: the height of a row, and the space around the rows of a group.
-ROW_HEIGHT, ROWS_PAD = 23, 7
-# Texts and sliders scale with the window.
+# Texts scale with the window; Dear ImGui's sliders do not.
 FULL_SIZE, LEAST_SCALE, MOST_SCALE = (1280, 720), 0.8, 4.0
 # How much larger images must be one under the other to be preferred to side by side.
 BELOW_FROM = 1.2
@@ -33,9 +33,9 @@ class Rect(NamedTuple):
     width: int
     height: int
 
-    def moved(self, right: int, down: int) -> "Rect":
-        """Return the box elsewhere."""
-        return self._replace(left=self.left + right, top=self.top + down)
+    def widened(self, by: int) -> "Rect":
+        """Return the box with so many pixels around it."""
+        return Rect(self.left - by, self.top - by, self.width + 2 * by, self.height + 2 * by)
 
     @property
     def right(self) -> int:
@@ -97,7 +97,7 @@ class WindowLayout:
     @property
     def strip(self) -> Rect:
         """Sliders and read-outs, beneath the 3D view."""
-        height = min(self.px(STRIP_HEIGHT), self.height // 3)
+        height = min(max(STRIP_HEIGHT, self.px(STRIP_HEIGHT)), self.height // 3)
         return Rect(0, self.height - height, self.panel.left, height)
 
     @property
@@ -118,7 +118,7 @@ class WindowLayout:
 
     @property
     def readouts(self) -> Rect:
-        width = self.px(READOUT_WIDTH) if self.strip.width >= self.px(STRIP_WITH_READOUTS) else 0
+        width = self.px(READOUT_WIDTH) if self.strip.width >= STRIP_WITH_READOUTS else 0
         return Rect(self.strip.right - width, self.strip.top, width, self.strip.height)
 
     @property
@@ -132,6 +132,11 @@ class WindowLayout:
         """The line at the foot of the 3D view, beside the compass, from which a box of warnings grows upwards."""
         left, gap = self.compass.right + self.px(FINDINGS_GAP), self.px(FINDINGS_GAP)
         return Rect(left, self.scene.bottom - gap, self.scene.right - gap - left, 0)
+
+    @property
+    def highest_warning(self) -> int:
+        """The row above which no warning is: their box grows no higher."""
+        return self.foot.bottom - int(MOST_WARNED * self.scene.height)
 
     @property
     def most_findings(self) -> int:
@@ -153,7 +158,7 @@ class WindowLayout:
                 round(gap * (i + 1) + edges[i]),
                 self.strip.top + gap,
                 round(edges[i + 1] - edges[i]),
-                self.strip.height - 2 * gap,
+                min(STRIP_HEIGHT - 2 * STRIP_GAP, self.strip.height - 2 * gap),
             )
             for i in range(len(widths))
         ]
@@ -162,24 +167,19 @@ class WindowLayout:
         """Return the total width of this many boxes of sliders [pixels]."""
         return self.readouts.left - self.px(STRIP_GAP) * (count + 1)
 
-    def scanner_sliders(self, counts: list[int]) -> list[Rect]:
-        """Return boxes of groups of so many of the scanner's sliders, one under the other beside the panel, lower where many have to fit."""
-        gap, pads = self.px(SCANNER_GAP), 2 * self.slider_pad
-        room = self.scene.height - gap * (len(counts) + 1) - pads * len(counts)
-        pitch = min(self.px(ROW_HEIGHT), room / (sum(counts) + len(counts)))
-        heights = [int(pitch * (count + 1)) + pads for count in counts]
-        tops = self.scene.top + gap + np.cumsum([0, *(height + gap for height in heights[:-1])])
-        left, width = self.scene.right - self.px(SCANNER_WIDTH), self.px(SCANNER_WIDTH) - gap
-        return [Rect(left, int(top), width, height) for top, height in zip(tops, heights, strict=True)]
-
-    def slider_pitch(self, box: Rect, count: int) -> float:
-        """Return the height of a row in the box of so many sliders: there is one more, for their name."""
-        return min(self.px(ROW_HEIGHT), (box.height - 2 * self.slider_pad) / (count + 1))
-
-    @property
-    def slider_pad(self) -> int:
-        """The space around the rows of a group of sliders."""
-        return self.px(ROWS_PAD)
+    def scanner_sliders(self, sizes: list[tuple[int, int]]) -> list[Rect]:
+        """Return boxes of these widths and heights beside the panel: one under the other, and where there is no more room, in a further
+        column.
+        """
+        gap = self.px(SCANNER_GAP)
+        right, first, room = self.scene.right - gap, self.scene.top + gap, self.scene.height - 2 * gap
+        top, boxes = first, list[Rect]()
+        for width, height in sizes:
+            if boxes and top + height > first + room:
+                right, top = min(box.left for box in boxes) - gap, first
+            boxes.append(Rect(right - width, top, width, min(height, room)))
+            top += height + gap
+        return boxes
 
     @property
     def whole(self) -> Rect:

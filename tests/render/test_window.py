@@ -13,10 +13,10 @@ import pytest
 from conftest import ROOT
 from PIL import Image
 
-from render.sliders import Slider, boxes_of
+from render.sliders import boxes_of, groups_of
 from render.ultrasound_panel import CALIPER
 from render.viewer import Geometry, Settings
-from render.window_layout import WindowLayout
+from render.window_layout import Rect, WindowLayout
 
 pytestmark = pytest.mark.skipif(
     not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Xvfb and xdotool"
@@ -122,13 +122,19 @@ class Screen:
         return [path for path in paths if path.read_bytes()[-8:-4] == b"IEND"]
 
 
-def slider(name: str) -> Slider:
-    """A slider of the window."""
+def slider(name: str) -> Rect:
+    """Where a slider of the window is, without its label."""
     geometry = Geometry(
         (None, np.zeros((0, 3))), np.zeros((2, 3)), tumour=(1, 1), parts={"vessel": (1, 1)}, support=(1, 1)
     )
-    boxes = boxes_of(Settings(young_kpa=15.0), geometry, WindowLayout(*WINDOW))
-    return next(each for shown in boxes for each in shown.sliders if each.name == name)
+    settings = Settings(young_kpa=15.0)
+    boxes = boxes_of(settings, geometry, WindowLayout(*WINDOW))
+    for group, members in groups_of(settings, geometry).items():
+        for place, member in enumerate(members):
+            if member.name == name:
+                left, top, width, _ = boxes[group]
+                return Rect(left + 8, top + 27 + 23 * place, round(0.65 * width), 19)
+    raise KeyError(name)
 
 
 @pytest.fixture
@@ -187,7 +193,7 @@ def test_the_mouse_moves_and_presses_the_transducer(screen):
     while not all(each.exists() for each in exported) and time.monotonic() < end:
         time.sleep(0.5)
     assert all(each.exists() for each in exported)
-    level = slider("level_hu").track
+    level = slider("level_hu")
     screen.point(level.left + level.width // 2, level.top + level.height // 2)
     time.sleep(0.5)
     screen.do("mousedown", 1)
