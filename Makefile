@@ -66,4 +66,4 @@ licences: .cache/release/.tools
 	@touch $@
 
 clean:
-	rm -rf .venv .cache out
+	rm -rf .venv .cache

@@ -19,6 +19,7 @@ from rehearsal.commands.command_line import (
 )
 from rehearsal.configuration import probe_of
 from rehearsal.planning.plan_file import FASTEST_MM_S, MOST_MARGIN_MM, MOST_SWEEPS, SLOWEST_MM_S, write_plan
+from rehearsal.result_files import counted
 from scenes.anatomy import fingerprint
 from scenes.scene import EMBEDDED, Trocar
 from scenes.terminal import shell_command
@@ -91,7 +92,7 @@ def plan(asked: PlanOptions) -> None:
     write_plan(made, out)
     click.echo("\n".join(made.why))
     click.echo(
-        f"Wrote {len(made.sweeps)} sweeps to {out}; follow the first with: {rehearse_command_line(asked.scene, out, asked.probe)}"
+        f"Wrote {counted(len(made.sweeps), 'sweep')} to {out}; follow the first with: {rehearse_command_line(asked.scene, out, asked.probe)}"
     )
 
 
@@ -114,7 +115,7 @@ def plan_resection(asked: PlanOptions) -> None:
     )
     click.echo(table_of(proposals))
     click.echo(
-        f"Wrote {len(cuts)} cuts to {asked.out}; rehearse the first with: {rehearse_command_line(asked.scene, asked.out, asked.probe)}"
+        f"Wrote {counted(len(cuts), 'cut')} to {asked.out}; rehearse the first with: {rehearse_command_line(asked.scene, asked.out, asked.probe)}"
     )
 
 

@@ -114,8 +114,9 @@ def scan(asked: ScanOptions) -> None:
         click.echo(
             f"Warning: {scans.empty} of {len(pose_by_name)} poses show nothing of the organ; they may be of another patient."
         )
+    sweep = ", sweep.igs.mha" if asked.sweep else ""
     click.echo(
-        f"Wrote {len(scans.rows)} images of {len(pose_by_name)} poses and scan.json to {out}; {np.median(scans.ms):.1f} ms per pose (median)."
+        f"Wrote {len(scans.rows)} images of {len(pose_by_name)} poses, scan.json{sweep} to {out}; {np.median(scans.ms):.1f} ms per pose (median)."
     )
 
 

@@ -229,7 +229,7 @@ def test_attached_points_move_with_the_body(free):
     on_surface = igl.point_mesh_squared_distance(rest.astype(float), *surface)[2]
     beside = np.linalg.norm(rest - at, axis=1) > 1e-4
     assert beside.sum() > 100 and np.abs(at - on_surface)[beside].max() < 1e-4
-    turned = at if free.model == "neo-hookean" else rest
+    turned = rest if free.model == "shape-matching" else at
     assert np.abs(array_of(embedding.skin.vertices) - (turned @ turn.T + way + rest - turned)).max() < 1e-4
 
 
