@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import trimesh
 
-from rehearsal.planning.plan_file import Plan, PlannedSweep
+from rehearsal.planning.plan_file import LIFT_MM, Plan, PlannedSweep
 from rehearsal.planning.sweep_path import frame_towards
 from rehearsal.planning.sweep_score import ScoreTerms
 from scenes.scene import Trocar
@@ -74,6 +74,7 @@ def sweep_of(*passes: np.ndarray, name: str = "two passes", seen: float = 0.75) 
         points=dict(seen=75.0),
         trials=8,
         passes=[in_patient(each) for each in passes],
+        lifts_mm=[LIFT_MM] * (len(passes) - 1),
     )
 
 

@@ -7,10 +7,20 @@ A path is a list of passes, each the poses (n, 4, 4) of a probe in contact; betw
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ultrasound.probe_manipulator import ProbeManipulator, advanced, pose_at, rigid, touching
+from rehearsal.planning.instrument_reach import clear_of_organ
+from ultrasound.probe_manipulator import (
+    ProbeManipulator,
+    advanced,
+    pose_at,
+    poses_between,
+    rigid,
+    touching,
+)
 
 # Largest distance and angle between poses of a pass.
 STEP_MM, STEP_DEG = 1.5, 2.0
+# Lifts between two passes [mm], of which the least is taken that keeps the probe outside the organ, on ways at these steps.
+LIFTS_MM, WAY_MM = (6.0, 12.0, 18.0, 24.0, 36.0, 48.0, 72.0, 96.0), 3.0
 # Rays towards the organ's surface start this far outside [mm].
 FAR_MM = 300.0
 
@@ -74,6 +84,22 @@ def tilting(
             angles = np.linspace(*angles_deg, count)[:: (-1) ** number]
             passes.append(np.stack([tilted(upright, manipulator.size_mm[2], each) for each in angles]))
     return passes
+
+
+def transfer_lift(manipulator: ProbeManipulator, end: np.ndarray, start: np.ndarray) -> float:
+    """The least lift [mm] with which the probe moves outside the settled organ, from the end of a pass to the start of the next (4, 4).
+
+    The greatest of ``LIFTS_MM`` where all of them touch it.
+    """
+    for lift in LIFTS_MM[:-1]:
+        up = [
+            [advanced(pose, -each) for each in np.arange(LIFTS_MM[0], lift, WAY_MM)] for pose in (end, start)
+        ]
+        ends = advanced(end, -lift), advanced(start, -lift)
+        count = max(1, int(np.ceil(np.linalg.norm(ends[1][:3, 3] - ends[0][:3, 3]) / WAY_MM)))
+        if clear_of_organ(manipulator, np.array([*up[0], *poses_between(*ends, count), *up[1]])).all():
+            return lift
+    return LIFTS_MM[-1]
 
 
 def pose_over(

@@ -11,6 +11,7 @@ from ultrasound.probe_manipulator import ProbeManipulator
 WORDING = {
     "seen": (100.0, "covers {} of the target", 100, "{:.0f} %"),
     "compression_mean_mm": (-3.0, "compresses the tissue by {} on average", 1, "{:.1f} mm"),
+    "compression_max_mm": (0.0, "by {} at most", 1, "{:.1f} mm"),
     "over_limit": (-50.0, "exceeds the compression limit at {} of its poses", 100, "{:.0f} %"),
     "contact": (5.0, "has contact on {} of the array", 100, "{:.0f} %"),
     "incidence_deg": (-0.2, "has a mean angle of incidence of {}", 1, "{:.0f} degrees"),

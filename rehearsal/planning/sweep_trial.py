@@ -8,7 +8,8 @@ from itertools import pairwise
 import numpy as np
 
 from rehearsal.planning.instrument_reach import clear_of_organ, reachable
-from rehearsal.planning.plan_file import DEG_PER_MM, LIFT_MM, PlanError
+from rehearsal.planning.plan_file import DEG_PER_MM, LIFT_MM, LIFTED_MM_S, PlanError
+from rehearsal.planning.sweep_path import transfer_lift
 from rehearsal.planning.sweep_score import MEANS, ScoreTerms, TriedPass, face_centres, incidence_deg, path_mm
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy, fingerprint
@@ -25,10 +26,8 @@ from ultrasound.target import Target
 PLACES = 1500
 # Passes of a search are tried at this speed, from so near above the first pose [mm].
 TRIAL_MM_S, ABOVE_MM = 60.0, 2.0
-# The most steps of a move between passes.
-MOST_STEPS = 240
-# Poses from a file are rounded: an excess of this fraction of a step, or this distance, does not add a step.
-ROUNDED_STEPS, ROUNDED_MM = 1e-3, 1e-4
+# Poses from a file are rounded: an excess of this fraction of a step does not add a step.
+ROUNDED_STEPS = 1e-3
 
 
 @dataclass(frozen=True)
@@ -88,8 +87,8 @@ class Trial:
     def run(self, passes: list[np.ndarray], speed_mm_s: float) -> ScoreTerms:
         """Follow a path at a speed on its passes; deterministic."""
         self._begin(speed_mm_s)
-        for poses in passes:
-            self._approach(poses[0])
+        for poses, lift_mm in zip(passes, [None, *self.lifts_mm(passes)], strict=False):
+            self._approach(poses[0], lift_mm)
             self._follow(poses)
         return self.terms(
             passes,
@@ -149,6 +148,11 @@ class Trial:
         sums = len(poses) * np.array([getattr(terms, name) for name in MEANS])
         return TriedPass(parameters, seen, sums, len(poses), path_mm(self.rehearsal.manipulator, poses))
 
+    def lifts_mm(self, passes: list[np.ndarray]) -> list[float]:
+        """How far the probe is lifted from one pass to the next."""
+        manipulator = self.rehearsal.manipulator
+        return [transfer_lift(manipulator, one[-1], other[0]) for one, other in pairwise(passes)]
+
     def held(self, passes: list[np.ndarray]) -> np.ndarray:
         """Whether the instrument can hold each pose; and for each pass whether the lifted probe is outside the organ, where it starts."""
         # In a hollow of the organ it may be inside another part of it.
@@ -172,21 +176,20 @@ class Trial:
             self._move(start, end)
             self._measure()
 
-    def _approach(self, pose: np.ndarray) -> None:
-        """Lift the probe, move it above a pose as the probe manipulator does, around the organ, and lower it there."""
+    def _approach(self, pose: np.ndarray, lift_mm: float | None) -> None:
+        """Lower the probe to a pose: from above it, or lifted from where it is, as ``plan_file.timed_poses`` does."""
         rehearsal = self.rehearsal
-        if self._steps_taken == 0:
-            rehearsal.pose = advanced(pose, -LIFT_MM)
+        above = advanced(pose, -LIFT_MM)
+        if lift_mm is None:
+            rehearsal.pose = above
         else:
-            for goal in (advanced(rehearsal.pose, -LIFT_MM), advanced(pose, -LIFT_MM)):
-                for _ in range(MOST_STEPS):
-                    if np.allclose(rehearsal.pose, goal, rtol=0.0, atol=ROUNDED_MM):
-                        break
-                    self._step(rehearsal.pose_towards(goal))
+            goals = [advanced(rehearsal.pose, -lift_mm), advanced(pose, -lift_mm)]
+            for goal in goals if lift_mm == LIFT_MM else [*goals, above]:
+                self._move(rehearsal.pose, goal, LIFTED_MM_S)
         self._move(rehearsal.pose, pose)
 
-    def _move(self, start: np.ndarray, end: np.ndarray) -> None:
-        for pose in poses_between(start, end, self._steps(start, end))[1:]:
+    def _move(self, start: np.ndarray, end: np.ndarray, speed_mm_s: float | None = None) -> None:
+        for pose in poses_between(start, end, self._steps(start, end, speed_mm_s or self._speed_mm_s))[1:]:
             self._step(pose)
 
     def _step(self, pose: np.ndarray) -> None:
@@ -199,11 +202,11 @@ class Trial:
         start_face, end_face = face_centres(self.rehearsal.manipulator, np.stack([start, end]))
         return float(np.linalg.norm(end_face - start_face))
 
-    def _steps(self, start: np.ndarray, end: np.ndarray) -> int:
+    def _steps(self, start: np.ndarray, end: np.ndarray, speed_mm_s: float) -> int:
         cosine = (np.einsum("ij,ij->", start[:3, :3], end[:3, :3]) - 1) / 2
         angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
         path_mm = max(self._distance_mm(start, end), angle / DEG_PER_MM)
-        steps = path_mm / (self._speed_mm_s * self.rehearsal.settings.time_step_s)
+        steps = path_mm / (speed_mm_s * self.rehearsal.settings.time_step_s)
         return max(1, int(np.ceil(steps - ROUNDED_STEPS)))
 
     def _measure(self) -> None:

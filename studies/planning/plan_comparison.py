@@ -98,7 +98,7 @@ def compare(
     ]
     outcomes: list[ScoreTerms] = []
     judges = TrialWorkers(replace(problem, scene=scene_of(scene, JUDGED_ON)), workers)
-    for terms, _ in judges.map(try_path, [(make, SPEED_MM_S) for make in paths]):
+    for terms, *_ in judges.map(try_path, [(make, SPEED_MM_S) for make in paths]):
         outcomes.append(terms)
         done(work_at(SPEED_MM_S))
     rows = [_row(name, [one]) for name, one in zip(["planned", *UNPLANNED], outcomes, strict=False)]

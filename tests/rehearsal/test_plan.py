@@ -29,6 +29,7 @@ from rehearsal.planning.sweep_path import (
     sliding,
     tilted,
     tilting,
+    transfer_lift,
     turned,
 )
 from rehearsal.planning.sweep_score import (
@@ -313,9 +314,24 @@ def test_the_largest_disadvantage_is_explained_too():
     assert ", although it has a path of 60 mm instead of 20 mm (" in text
 
 
+@pytest.mark.parametrize(("apart_deg", "least_mm", "most_mm"), [(10, 6, 6), (50, 6, 18), (110, 18, 48)])
+def test_the_probe_is_lifted_over_the_organ_from_one_pass_to_the_next(apart_deg, least_mm, most_mm):
+    manipulator = manipulator_on(big_ball())
+    ends = []
+    for side in (-0.5, 0.5):
+        angle = np.radians(side * apart_deg)
+        outward = np.array([np.sin(angle), 0.0, np.cos(angle)])
+        ends.append(pose_at((R - 2.0) * outward, -outward, Y, SIZE[2]))
+    lift = transfer_lift(manipulator, *ends)
+    assert least_mm <= lift <= most_mm and lift == transfer_lift(manipulator, *ends[::-1])
+    # In the middle of the way the face is outside the ball.
+    middle = np.cos(np.radians(apart_deg / 2)) * (R - 2.0 + lift)
+    assert middle > R - 1.0
+
+
 def test_the_score_terms_are_a_sentence():
     assert in_words(ScoreTerms(0.94, 2.2, 3.4, 0.0, 0.97, 4.6, 211.0, 21.0, 1.0)) == (
-        "it covers 94 % of the target, compresses the tissue by 2.2 mm on average, exceeds the compression limit at 0 % of its poses, "
+        "it covers 94 % of the target, compresses the tissue by 2.2 mm on average, by 3.4 mm at most, exceeds the compression limit at 0 % of its poses, "
         "has contact on 97 % of the array, has a mean angle of incidence of 5 degrees, and has a path of 211 mm"
     )
 

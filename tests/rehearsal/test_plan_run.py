@@ -133,11 +133,10 @@ def run(trial: Trial, path: list[np.ndarray], speed_mm_s: float = SPEED_MM_S) ->
 @pytest.mark.parametrize("count", [1, 3, 40])
 def test_a_whole_number_of_steps_stays_one_where_poses_were_rounded(trial, count):
     start, end = trial.rehearsal.manipulator.home, trial.rehearsal.manipulator.home.copy()
-    trial._speed_mm_s = SPEED_MM_S
     step_mm = SPEED_MM_S * trial.rehearsal.settings.time_step_s
     for off_mm, steps in ((-1e-6, count), (0.0, count), (1e-6, count), (0.01 * step_mm, count + 1)):
         end[:3, 3] = start[:3, 3] + [0.0, 0.0, count * step_mm + off_mm]
-        assert trial._steps(start, end) == steps
+        assert trial._steps(start, end, SPEED_MM_S) == steps
 
 
 def test_a_trial_gives_the_same_figures_twice_whatever_was_tried_between(trial):

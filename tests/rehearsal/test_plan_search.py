@@ -72,7 +72,7 @@ class Counting:
         }
         for number, task in enumerate(tasks):
             if function is try_path:
-                yield replace(GOOD, seen=0.1 * number), [straight_pass(4)]
+                yield replace(GOOD, seen=0.1 * number), [straight_pass(4)], []
             else:
                 yield stand_ins[function](*task)
 
@@ -90,7 +90,11 @@ class Counting:
     def swept(self, kind: PassKind, parameters: list[np.ndarray], speed: float) -> TriedPath:
         self.sweeps.append((kind.side, parameters, speed))
         seen = np.any([trial_of(kind, each, self.handicaps[kind.side]).seen for each in parameters], axis=0)
-        return replace(GOOD, seen=float(seen.mean())), [straight_pass(4)] * len(parameters)
+        return (
+            replace(GOOD, seen=float(seen.mean())),
+            [straight_pass(4)] * len(parameters),
+            [12.0] * (len(parameters) - 1),
+        )
 
 
 def three(**changes) -> Counting:
@@ -226,12 +230,12 @@ def test_the_best_sets_are_tried_as_sweeps_and_ranked():
     workers, done = three(), []
     searches = search(workers.kinds, workers, 30, lambda _: None)
     rows = ranked(searches[::-1], workers, 12.0, done.append)
-    assert [one.kind.side for one, _, _ in rows] == ["side 1", "side 2"]
+    assert [one.kind.side for one, *_ in rows] == ["side 1", "side 2"]
     assert done == [plan_search.work_at(12.0)] * 2 and {speed for _, _, speed in workers.sweeps} == {12.0}
-    for one, _, passes in rows:
+    for one, _, passes, lifts_mm in rows:
         (parameters,) = [asked for side, asked, _ in workers.sweeps if side == one.kind.side]
         assert np.array_equal(parameters, [each.parameters for each in one.best])
-        assert len(passes) == len(one.best)
+        assert len(passes) == len(one.best) == len(lifts_mm) + 1
 
 
 # A plan made
