@@ -1,5 +1,6 @@
 """A ball under a probe, plans over it, and what stands for the processes that try them."""
 
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,7 @@ from rehearsal.planning.sweep_path import frame_towards
 from rehearsal.planning.sweep_score import ScoreTerms
 from scenes.scene import Trocar
 from ultrasound.probe import load_probe
-from ultrasound.probe_manipulator import ProbeManipulator, image_plane, pose_at
+from ultrasound.probe_manipulator import ProbeManipulator, advanced, image_plane, pose_at
 
 R = 30.0
 SIZE = np.array([16.0, 9.0, 20.0])
@@ -74,7 +75,10 @@ def sweep_of(*passes: np.ndarray, name: str = "two passes", seen: float = 0.75) 
         points=dict(seen=75.0),
         trials=8,
         passes=[in_patient(each) for each in passes],
-        lifts_mm=[LIFT_MM] * (len(passes) - 1),
+        transfers=[
+            in_patient(np.stack([advanced(one[-1], -LIFT_MM), advanced(other[0], -LIFT_MM)]))
+            for one, other in pairwise(passes)
+        ],
     )
 
 

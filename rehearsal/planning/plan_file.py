@@ -12,6 +12,7 @@ from pydantic import (
     Field,
     JsonValue,
     ValidationError,
+    ValidationInfo,
     field_validator,
     model_validator,
 )
@@ -52,7 +53,7 @@ class PlannedSweep(_FileModel):
     """One candidate.
 
     ``parts`` are its ``ScoreTerms`` by name, ``points`` what each adds to the score, ``trials`` the passes that were tried for it.
-    ``lifts_mm`` are how far the probe is lifted from one pass to the next, so that it moves outside the organ. ``passes`` are its poses, probe to patient; the probe's axes are PLUS's (``ultrasound.probe_manipulator``).
+    ``transfers`` are poses from each pass to above the next, outside the organ. ``passes`` are its poses, probe to patient; the probe's axes are PLUS's (``ultrasound.probe_manipulator``).
     """
 
     name: str
@@ -61,15 +62,15 @@ class PlannedSweep(_FileModel):
     points: dict[str, float]
     trials: int
     passes: list[Annotated[list[Pose], Field(min_length=2, max_length=MOST_POSES)]] = Field(min_length=1)
-    lifts_mm: list[Annotated[float, Field(ge=LIFT_MM, le=500)]]
+    transfers: list[Annotated[list[Pose], Field(min_length=1, max_length=MOST_POSES)]]
 
-    @model_validator(mode="after")
-    def _check_lifts(self) -> "PlannedSweep":
-        if len(self.lifts_mm) != len(self.passes) - 1:
-            raise ValueError(
-                f"lifts_mm has {len(self.lifts_mm)} values: expected one between two passes each, {len(self.passes) - 1}"
-            )
-        return self
+    @field_validator("transfers")
+    @classmethod
+    def _check_transfers(cls, transfers: list, info: ValidationInfo) -> list:
+        wanted = len(info.data.get("passes", [None])) - 1
+        if len(transfers) != wanted:
+            raise ValueError(f"expected poses from each pass to the next, {wanted} lists")
+        return transfers
 
     @field_validator("parts")
     @classmethod
@@ -147,20 +148,21 @@ def timed_poses(sweep: PlannedSweep, speed_mm_s: float) -> TimedPoses:
     """The poses of a sweep with times, at a speed on its passes; the probe starts above the first pose and is lifted between passes."""
     poses: list[np.ndarray] = []
     speeds: list[float] = []
-    for each, before_mm, after_mm in zip(
-        sweep.poses(), [LIFT_MM, *sweep.lifts_mm], [*sweep.lifts_mm, LIFT_MM], strict=True
-    ):
-        above = [_lifted(each[0], lift) for lift in dict.fromkeys((before_mm, LIFT_MM))]
-        poses += [*above, *each, _lifted(each[-1], after_mm)]
-        speeds += [*(LIFTED_MM_S for _ in above), *(speed_mm_s for _ in each), LIFTED_MM_S]
+    passes = sweep.poses()
+    before = [np.array([_lifted(passes[0][0])]), *map(np.array, sweep.transfers)]
+    for way, each in zip(before, passes, strict=True):
+        poses += [*way, *each]
+        speeds += [*(LIFTED_MM_S for _ in way), *(speed_mm_s for _ in each)]
+    poses.append(_lifted(passes[-1][-1]))
+    speeds.append(LIFTED_MM_S)
     durations = [_length_mm(a, b) / speed for (a, b), speed in zip(pairwise(poses), speeds[1:], strict=True)]
     return TimedPoses(np.cumsum([0.0, APPROACH_S, *durations]), [poses[0], *poses])
 
 
-def _lifted(pose: np.ndarray, lift_mm: float) -> np.ndarray:
+def _lifted(pose: np.ndarray) -> np.ndarray:
     """A probe's pose in the patient (4, 4), in PLUS's axes, moved back along the probe's axis."""
     above = pose.copy()
-    above[:3, 3] -= lift_mm * pose[:3, 1]
+    above[:3, 3] -= LIFT_MM * pose[:3, 1]
     return above
 
 

@@ -39,8 +39,8 @@ ROUND_TRIALS = 8
 USUAL_PATH_MM = 250.0
 DIGITS = 6
 Progress = Callable[[int], Any]
-# The score terms of a path, the poses (n, 4, 4) of its passes: probe in the patient, in PLUS's axes (LPS, mm), and the lifts between them.
-TriedPath = tuple[ScoreTerms, list[np.ndarray], list[float]]
+# The score terms of a path, the poses (n, 4, 4) of its passes: probe in the patient, in PLUS's axes (LPS, mm), and those from each to the next.
+TriedPath = tuple[ScoreTerms, list[np.ndarray], list[np.ndarray]]
 
 
 class PassSearch:
@@ -115,8 +115,12 @@ def try_path(trial: Trial, make: Callable[[Trial], list[np.ndarray]], speed_mm_s
     """Try a path that is made for the trial."""
     passes = make(trial)
     terms = trial.run(passes, speed_mm_s)
-    placed = [np.stack([probe_in_patient(trial.rehearsal, pose) for pose in each]) for each in passes]
-    return terms, placed, trial.lifts_mm(passes)
+    return terms, _placed(trial, passes), _placed(trial, trial.transfers(passes))
+
+
+def _placed(trial: Trial, ways: list[np.ndarray]) -> list[np.ndarray]:
+    """Poses as those of the probe in the patient."""
+    return [np.stack([probe_in_patient(trial.rehearsal, pose) for pose in each]) for each in ways]
 
 
 def _in_order(trial: Trial, kind: PassKind, parameters: list[np.ndarray]) -> list[np.ndarray]:
@@ -168,9 +172,9 @@ def make_plan(workers: Trials, speed_mm_s: float, trials: int, progress: Progres
             points=_rounded(points(terms)),
             trials=len(one.tried),
             passes=[np.round(each, DIGITS).tolist() for each in passes],
-            lifts_mm=lifts_mm,
+            transfers=[np.round(each, DIGITS).tolist() for each in transfers],
         )
-        for one, terms, passes, lifts_mm in rows
+        for one, terms, passes, transfers in rows
     ]
     first, *others = [(sweep.name, terms) for sweep, (_, terms, *_) in zip(sweeps, rows, strict=True)]
     why = [f"The first sweep is {first[0]}, with {score(first[1]):.1f} points: {in_words(first[1])}."]
@@ -232,7 +236,7 @@ def _try(
 
 def ranked(
     searches: list[PassSearch], workers: Trials, speed_mm_s: float, progress: Progress
-) -> list[tuple[PassSearch, ScoreTerms, list[np.ndarray], list[float]]]:
+) -> list[tuple[PassSearch, ScoreTerms, list[np.ndarray], list[np.ndarray]]]:
     """The best set of each search as a sweep at the planned speed; highest score first."""
     tasks = [(one.kind, [each.parameters for each in one.best], speed_mm_s) for one in searches]
     rows = []

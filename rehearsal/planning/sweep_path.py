@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rehearsal.planning.instrument_reach import clear_of_organ
+from rehearsal.planning.plan_file import LIFT_MM
 from ultrasound.probe_manipulator import (
     ProbeManipulator,
     advanced,
@@ -20,7 +21,7 @@ from ultrasound.probe_manipulator import (
 # Largest distance and angle between poses of a pass.
 STEP_MM, STEP_DEG = 1.5, 2.0
 # Lifts between two passes [mm], of which the least is taken that keeps the probe outside the organ, on ways at these steps.
-LIFTS_MM, WAY_MM = (6.0, 12.0, 18.0, 24.0, 36.0, 48.0, 72.0, 96.0), 3.0
+LIFTS_MM, WAY_MM, ARC_DEG = (LIFT_MM, 12.0, 24.0, 48.0, 96.0), 3.0, 15.0
 # Rays towards the organ's surface start this far outside [mm].
 FAR_MM = 300.0
 
@@ -86,20 +87,39 @@ def tilting(
     return passes
 
 
-def transfer_lift(manipulator: ProbeManipulator, end: np.ndarray, start: np.ndarray) -> float:
-    """The least lift [mm] with which the probe moves outside the settled organ, from the end of a pass to the start of the next (4, 4).
+def transfer(manipulator: ProbeManipulator, end: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """The poses (n, 4, 4) of the probe, from the end of a pass to above the start of the next, which keep it outside the settled organ.
 
-    The greatest of ``LIFTS_MM`` where all of them touch it.
+    It is lifted off, moves straight, at the least of ``LIFTS_MM`` at which that is possible, or else around the organ, and is lowered.
     """
-    for lift in LIFTS_MM[:-1]:
-        up = [
-            [advanced(pose, -each) for each in np.arange(LIFTS_MM[0], lift, WAY_MM)] for pose in (end, start)
-        ]
+    above = advanced(start, -LIFTS_MM[0])
+    for lift in LIFTS_MM:
         ends = advanced(end, -lift), advanced(start, -lift)
         count = max(1, int(np.ceil(np.linalg.norm(ends[1][:3, 3] - ends[0][:3, 3]) / WAY_MM)))
-        if clear_of_organ(manipulator, np.array([*up[0], *poses_between(*ends, count), *up[1]])).all():
-            return lift
-    return LIFTS_MM[-1]
+        rising = [
+            advanced(pose, -each) for pose in (end, start) for each in np.arange(LIFTS_MM[0], lift, WAY_MM)
+        ]
+        if clear_of_organ(manipulator, np.array([*rising, *poses_between(*ends, count)])).all():
+            return np.array([*ends, above] if lift > LIFTS_MM[0] else ends)
+    return np.array([*_around(manipulator, *ends), above])
+
+
+def _around(manipulator: ProbeManipulator, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Poses (n, 4, 4) from one to another on an arc about the middle of the organ, which is outside of it."""
+    middle = manipulator.vertices.mean(axis=0)
+    outside = np.linalg.norm(manipulator.vertices - middle, axis=1).max() + np.linalg.norm(
+        manipulator.size_mm
+    )
+    arms = np.stack([start[:3, 3], end[:3, 3]]) - middle
+    lengths = np.linalg.norm(arms, axis=1)
+    turn = Rotation.align_vectors(arms[1:], arms[:1])[0].as_rotvec()
+    count = max(2, int(np.ceil(np.linalg.norm(turn) / np.radians(ARC_DEG))))
+    poses = poses_between(start, end, count)
+    share = np.linspace(0.0, 1.0, count + 1)
+    directions = Rotation.from_rotvec(share[:, None] * turn).apply(arms[0] / lengths[0])
+    away = np.maximum(lengths[0] + share * (lengths[1] - lengths[0]), outside)
+    poses[1:-1, :3, 3] = (middle + away[:, None] * directions)[1:-1]
+    return poses
 
 
 def pose_over(

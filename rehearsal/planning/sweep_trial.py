@@ -9,7 +9,7 @@ import numpy as np
 
 from rehearsal.planning.instrument_reach import clear_of_organ, reachable
 from rehearsal.planning.plan_file import DEG_PER_MM, LIFT_MM, LIFTED_MM_S, PlanError
-from rehearsal.planning.sweep_path import transfer_lift
+from rehearsal.planning.sweep_path import LIFTS_MM, transfer
 from rehearsal.planning.sweep_score import MEANS, ScoreTerms, TriedPass, face_centres, incidence_deg, path_mm
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy, fingerprint
@@ -87,8 +87,8 @@ class Trial:
     def run(self, passes: list[np.ndarray], speed_mm_s: float) -> ScoreTerms:
         """Follow a path at a speed on its passes; deterministic."""
         self._begin(speed_mm_s)
-        for poses, lift_mm in zip(passes, [None, *self.lifts_mm(passes)], strict=False):
-            self._approach(poses[0], lift_mm)
+        for poses, way in zip(passes, [None, *self.transfers(passes)], strict=False):
+            self._approach(poses[0], way)
             self._follow(poses)
         return self.terms(
             passes,
@@ -148,16 +148,15 @@ class Trial:
         sums = len(poses) * np.array([getattr(terms, name) for name in MEANS])
         return TriedPass(parameters, seen, sums, len(poses), path_mm(self.rehearsal.manipulator, poses))
 
-    def lifts_mm(self, passes: list[np.ndarray]) -> list[float]:
-        """How far the probe is lifted from one pass to the next."""
-        manipulator = self.rehearsal.manipulator
-        return [transfer_lift(manipulator, one[-1], other[0]) for one, other in pairwise(passes)]
+    def transfers(self, passes: list[np.ndarray]) -> list[np.ndarray]:
+        """The poses (n, 4, 4) from each pass to the next."""
+        return [transfer(self.rehearsal.manipulator, one[-1], other[0]) for one, other in pairwise(passes)]
 
     def held(self, passes: list[np.ndarray]) -> np.ndarray:
-        """Whether the instrument can hold each pose; and for each pass whether the lifted probe is outside the organ, where it starts."""
-        # In a hollow of the organ it may be inside another part of it.
-        starts = np.stack([advanced(each[0], -LIFT_MM) for each in passes])
-        clear = clear_of_organ(self.rehearsal.manipulator, starts)
+        """Whether the instrument can hold each pose; and whether the probe can be lifted off the organ from both ends of each pass."""
+        # In a hollow of the organ it would meet another part of it.
+        lifted = [advanced(pose, -lift) for each in passes for pose in each[[0, -1]] for lift in LIFTS_MM]
+        clear = clear_of_organ(self.rehearsal.manipulator, np.array(lifted))
         return np.concatenate([self.reach(np.concatenate(passes)), clear])
 
     def _begin(self, speed_mm_s: float) -> None:
@@ -176,17 +175,14 @@ class Trial:
             self._move(start, end)
             self._measure()
 
-    def _approach(self, pose: np.ndarray, lift_mm: float | None) -> None:
-        """Lower the probe to a pose: from above it, or lifted from where it is, as ``plan_file.timed_poses`` does."""
-        rehearsal = self.rehearsal
-        above = advanced(pose, -LIFT_MM)
-        if lift_mm is None:
-            rehearsal.pose = above
+    def _approach(self, pose: np.ndarray, way: np.ndarray | None) -> None:
+        """Lower the probe to a pose, after its way from another pass, if there was one."""
+        if way is None:
+            self.rehearsal.pose = advanced(pose, -LIFT_MM)
         else:
-            goals = [advanced(rehearsal.pose, -lift_mm), advanced(pose, -lift_mm)]
-            for goal in goals if lift_mm == LIFT_MM else [*goals, above]:
-                self._move(rehearsal.pose, goal, LIFTED_MM_S)
-        self._move(rehearsal.pose, pose)
+            for goal in way:
+                self._move(self.rehearsal.pose, goal, LIFTED_MM_S)
+        self._move(self.rehearsal.pose, pose)
 
     def _move(self, start: np.ndarray, end: np.ndarray, speed_mm_s: float | None = None) -> None:
         for pose in poses_between(start, end, self._steps(start, end, speed_mm_s or self._speed_mm_s))[1:]:

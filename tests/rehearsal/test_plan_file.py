@@ -105,7 +105,7 @@ ODD[3] = [0, 0, 0, 2.0]
         ("sweeps.0.passes.0.1.0.3", float("nan"), "input should be a finite number"),
         ("sweeps.0.passes.0.1.0.3", "far", "input should be a valid number"),
         ("sweeps.0.parts", dict(path_mm=3.0), "seen is missing"),
-        ("sweeps.0.lifts_mm", [6.0], "lifts_mm has 1 values: expected one between two passes each, 0"),
+        ("sweeps.0.transfers", [[np.eye(4).tolist()]], "expected poses from each pass to the next, 0 lists"),
         ("sweeps.0.parts.seen", float("nan"), "input should be a finite number"),
         ("sweeps.0.colour", "red", "unknown key"),
     ],
@@ -177,13 +177,6 @@ def test_a_sweep_as_a_track_goes_at_its_speed_and_is_lifted_between_passes(tmp_p
     speeds = way / np.diff(track.times_s)
     assert speeds[[1, 2, 3, 6, 7]] == pytest.approx(5.0) and speeds[[4, 5, 8]] == pytest.approx(LIFTED_MM_S)
     assert track.times_s[:2].tolist() == [0.0, APPROACH_S]
-    # Where the organ is in between, the probe is lifted higher, and comes down to its usual height first.
-    high = timed_poses(plan.sweeps[0].model_copy(update=dict(lifts_mm=[24.0])), 5.0)
-    places = np.array([pose[:3, 3] for pose in high.poses]) - ORIGIN
-    over = [[0, 3, 24.0], [9, 0, 24.0], [9, 0, LIFT_MM], [9, 0, 0]]
-    assert places == pytest.approx(np.array([*expected[:5], *over, *expected[-2:]], float))
-    speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(high.times_s)
-    assert speeds[4:7] == pytest.approx(LIFTED_MM_S) and speeds[7] == pytest.approx(5.0)
     turned = sweep_of(straight_pass(2, step_mm=0.0))
     turned.passes[0][1] = (np.array(turned.passes[0][1]) @ TURNED).tolist()
     assert np.diff(timed_poses(turned, 5.0).times_s)[2] == pytest.approx(40 / 1.5 / 5.0)

@@ -93,7 +93,7 @@ class Counting:
         return (
             replace(GOOD, seen=float(seen.mean())),
             [straight_pass(4)] * len(parameters),
-            [12.0] * (len(parameters) - 1),
+            [straight_pass(2)] * (len(parameters) - 1),
         )
 
 
@@ -232,10 +232,10 @@ def test_the_best_sets_are_tried_as_sweeps_and_ranked():
     rows = ranked(searches[::-1], workers, 12.0, done.append)
     assert [one.kind.side for one, *_ in rows] == ["side 1", "side 2"]
     assert done == [plan_search.work_at(12.0)] * 2 and {speed for _, _, speed in workers.sweeps} == {12.0}
-    for one, _, passes, lifts_mm in rows:
+    for one, _, passes, transfers in rows:
         (parameters,) = [asked for side, asked, _ in workers.sweeps if side == one.kind.side]
         assert np.array_equal(parameters, [each.parameters for each in one.best])
-        assert len(passes) == len(one.best) == len(lifts_mm) + 1
+        assert len(passes) == len(one.best) == len(transfers) + 1
 
 
 # A plan made
