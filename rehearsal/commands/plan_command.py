@@ -125,7 +125,7 @@ def table_of(proposals: list["Proposal"]) -> str:
 
     heads = [
         "technique",
-        "cost, ml",
+        "cost, points",
         "least margin, mm",
         "parenchyma, ml",
         "collecting system, mm2",

@@ -1,6 +1,7 @@
 """Whether an instrument through a trocar can hold the probe at a pose."""
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from scenes.scene import Trocar
 from ultrasound.probe_manipulator import ProbeManipulator
@@ -35,12 +36,14 @@ def reachable(
 def clear_of_organ(manipulator: ProbeManipulator, poses: np.ndarray) -> np.ndarray:
     """Whether the probe is outside the settled organ at each of the poses (n, 4, 4), bool (n,)."""
     half = manipulator.size_mm / 2
-    return np.array(
-        [
-            not (np.abs((manipulator.samples - at[:3, 3]) @ at[:3, :3]) < half).all(axis=1).any()
-            for at in poses
-        ]
-    )
+    samples = manipulator.samples
+    clear = np.ones(len(poses), bool)
+    # Few poses are so near that a point of the surface may be in the probe.
+    least = cdist(poses[:, :3, 3], samples, "sqeuclidean").min(axis=1)
+    for number in np.flatnonzero(least < half @ half):
+        local = (samples - poses[number, :3, 3]) @ poses[number, :3, :3]
+        clear[number] = not (np.abs(local) < half).all(axis=1).any()
+    return clear
 
 
 def _within(cosine: np.ndarray, most_deg: float) -> np.ndarray:

@@ -163,7 +163,7 @@ def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
         else [
             (
                 "against the plan",
-                f"{plan['cost_ml']:.1f} ml, planned {plan['planned_cost_ml']:.1f} ml by {plan['planned_technique']}",
+                f"cost {plan['cost_ml']:.1f} points, planned {plan['planned_cost_ml']:.1f} by {plan['planned_technique']}",
             )
         ]
     )
