@@ -179,4 +179,4 @@ def test_a_vessel_that_the_cut_only_grazes_is_none():
     assert np.pi * 2 * 5.0 * 0.01 < LEAST_OPENED_MM2
     assert divided_vessels(fine, grazing, None, {}) == ()
     assert len(divided_vessels(fine, ball(5.0, (0.0, 0.0, 3.0)), None, {})) == 1
-    assert divided_vessels(fine, None, None, {}) == ()
+    assert divided_vessels(fine, None, None, {}) is None, "not labelled"
