@@ -10,17 +10,22 @@ SCRIPTS := $(if $(filter Windows_NT,$(OS)),Scripts,bin)
 BIN := .venv/$(SCRIPTS)
 RELEASE := .cache/release/$(SCRIPTS)
 SHIPPED := .cache/shipped/$(SCRIPTS)
-INSTALL := -m pip install --quiet --disable-pip-version-check
+# Python compiles what it imports, and stores it; to compile all that is installed takes as long as to install it.
+INSTALL := -m pip install --quiet --disable-pip-version-check --no-compile
+unexport PYTHONDONTWRITEBYTECODE
 ARGS ?=
+
+# What the tests need is installed while the embedded patient is made.
+MAKEFLAGS += --jobs=2
 
 .PHONY: run test audit licences clean
 .DELETE_ON_ERROR:
 
-run: .venv/.run
+run: .venv/.patient
 	@sh .ci/system-packages vulkan
 	$(BIN)/python app.py rehearse $(ARGS)
 
-test: .venv/.dev
+test: .venv/.dev .venv/.patient
 	@sh .ci/system-packages vulkan window
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -49,8 +54,11 @@ licences: .cache/release/.tools
 	echo "Nephron needs Python 3.11, 3.12 or 3.13, found none; install one or name it: make PYTHON=/path/to/python3.12"; exit 1
 
 .venv/.run: requirements.txt .venv/pyvenv.cfg
-	@echo "Installing what Nephron needs into .venv: 1.1 GB, two to six minutes, once."
+	@echo "Installing what Nephron needs into .venv: 1.1 GB, one to six minutes, once."
 	@$(BIN)/python $(INSTALL) -r requirements.txt
+	@touch $@
+
+.venv/.patient: .venv/.run
 	@echo "Making the embedded patient: fifteen seconds, once."
 	-@$(BIN)/python -c "from scenes.phantom.embedded_patient import phantom_folder; phantom_folder()"
 	@touch $@

@@ -36,8 +36,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest first: no worker is left with it when the others have ended."""
-    items.sort(key=lambda item: item.path.stem != "test_window")
+    """The longest first: no worker is left with it when the others have ended, nor takes half of a file whose fixture takes long."""
+    items.sort(key=lambda item: item.path.stem not in ("test_window", "test_app"))
 
 
 def pytest_collection_finish() -> None:

@@ -8,7 +8,7 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from scipy import io, signal
+import scipy
 
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import ImagePlane
@@ -86,7 +86,7 @@ def rf_of(iq: np.ndarray, probe: Probe) -> tuple[np.ndarray, float]:
     """Return the RF signal (RF samples, scanlines) float32 of IQ (samples, scanlines), and its sampling frequency [MHz]."""
     duration_us = 2 * probe.depth_mm / SOUND_MM_US
     count = round(RF_PER_PERIOD * probe.frequency_mhz * duration_us)
-    envelope = signal.resample(iq, count, axis=0)
+    envelope = scipy.signal.resample(iq, count, axis=0)
     # The first IQ sample is half a sample behind the face.
     time_us = np.arange(count) * duration_us / count + probe.sample_mm / SOUND_MM_US
     carrier = np.exp(2j * np.pi * probe.frequency_mhz * time_us)[:, None]
@@ -104,7 +104,7 @@ def save_iq(signals: IQSignal, path: Path, suffix: str) -> None:
     arrays = asdict(signals)
     content = BytesIO()
     if suffix == "mat":
-        io.savemat(content, arrays, do_compression=True)
+        scipy.io.savemat(content, arrays, do_compression=True)
         # SciPy writes the date and the operating system.
         content.seek(0)
         content.write(MAT_HEADER.ljust(MAT_HEADER_BYTES))

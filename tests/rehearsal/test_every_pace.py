@@ -39,7 +39,7 @@ class SlowMachine(Pace):
     """Each step takes longer than the longest one simulates."""
 
     def watch(self, took_ms: float, length_s: float) -> None:
-        sleep(0.12)
+        sleep(0.08)
 
 
 def pace_at(level: int, kind: type[Pace] = Pace) -> Pace:
