@@ -197,6 +197,18 @@ def test_every_feature_at_once_without_a_ct_stays_finite_and_out_of_everything(o
     assert not any(image.any() for image in view.images.values())
 
 
+def test_an_image_has_the_rows_and_columns_asked_for_and_at_most_the_scenes(kept):
+    rehearsal = kept(pressed_phantom)
+    pixels = rehearsal.scene.image.pixels
+    for asked, made in (
+        ((40, 30), (40, 30)),
+        ((pixels + 1, 30), (pixels, 30)),
+        ((30, pixels + 1), (30, pixels)),
+    ):
+        view = image_view(rehearsal, rehearsal.probe, initial_settings(rehearsal), Tally(0.0), asked)
+        assert {image.shape[:2] for image in view.images.values()} == {made}
+
+
 def test_the_outline_is_the_tumours_border_not_what_is_drawn_of_it(kept):
     rehearsal = kept(pressed_phantom)
     for _ in range(20):

@@ -38,8 +38,12 @@ def pressed(pose, now, mesh, size=SIZE, radius=0.0):
 
 @pytest.mark.parametrize("x, y, wide, high", [(0, 0, 15, 7.5), (6, 7.75, 13.5, 6), (-6, -7.75, 13.5, 6)])
 def test_a_flat_face_on_a_flat_top_touches_where_they_overlap(block, x, y, wide, high):
-    # The edges of the block run between places, so that none is cut; whether its faces are large or small.
-    for mesh in (block, block.subdivide().subdivide().subdivide()):
+    # The edges of the block run between places, so that none is cut; whether its faces are large or small, from whichever corner.
+    small = block.subdivide().subdivide().subdivide()
+    turned = [
+        trimesh.Trimesh(small.vertices, np.roll(small.faces, n, axis=1), process=False) for n in range(3)
+    ]
+    for mesh in (block, *turned):
         assert pressed(over(x, y), mesh.vertices, mesh).area_mm2 == pytest.approx(wide * high, rel=1e-12)
 
 

@@ -50,6 +50,14 @@ def test_harmonics_have_the_square_of_the_beam_of_half_the_frequency_and_less_si
     assert less < 0.5 * plain
 
 
+def test_the_beams_of_a_curved_array_are_alike():
+    """As far from its ends as their apertures reach: turned about its middle, one is the other."""
+    probe, lag, depth = load_probe("curvilinear"), np.linspace(-60, 60, 241), np.array([20.0, 60.0])
+    one, other = (lateral_profiles(probe, middle(probe) + n, depth, lag) for n in (0, 50))
+    # Float32 phases of 60 mm are right to 0.001 of a radian.
+    assert other == pytest.approx(one, abs=1e-3)
+
+
 def test_the_beam_is_wider_at_the_arrays_end_and_where_it_is_steered():
     probe = load_probe("drop-in")
     # At the end, half of the aperture is left.

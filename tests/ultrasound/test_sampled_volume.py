@@ -70,21 +70,22 @@ def test_places_sampled_together_have_the_values_that_they_have_alone(device, sh
     assert 0.1 < (alone == -7.0).mean() < 0.9 and np.abs(together - alone).max() < 1e-5
 
 
-def test_the_gradient_of_a_volume_is_that_over_a_voxel_to_each_side(device):
+def test_the_gradient_of_a_volume_is_that_over_a_voxel_to_each_side_and_its_slope_that_within_a_cell(device):
     voxels = np.random.default_rng(4).normal(size=(6, 5, 4, 3)).astype(np.float32)
     index_from_mm = np.eye(4)
     index_from_mm[:3, :3] = rotation_about([3, 1, 2], 40) * [1.3, 0.7, 0.9]
-    volume = SampledVolume(voxels, index_from_mm)
+    volume, first_part = SampledVolume(voxels, index_from_mm), SampledVolume(voxels[..., 0], index_from_mm)
     last = np.array([5.0, 4.0, 3.0])
     inside = np.random.default_rng(5).uniform(-0.45, last + 0.45, (300, 3))
     points = np.vstack([inside, last + 0.6]) @ np.linalg.inv(index_from_mm[:3, :3]).T
-    given, gradient = ti.Vector.field(3, ti.f32, len(points)), ti.Vector.field(3, ti.f32, len(points))
+    given, gradient, slope = (ti.Vector.field(3, ti.f32, len(points)) for _ in range(3))
     fill((given, points))
 
     @ti.kernel
     def ask():
         for i in given:
             gradient[i] = volume.gradient(given[i])
+            slope[i] = first_part.slope(given[i])
 
     ask()
     value = RegularGridInterpolator([np.arange(n) for n in (6, 5, 4)], voxels[..., 0].astype(float))
@@ -98,7 +99,15 @@ def test_the_gradient_of_a_volume_is_that_over_a_voxel_to_each_side(device):
         along[:, axis] = (value(high) - value(low)) / (high - low)[:, axis]
     # Float32 of values of 4, in voxels of 0.7 mm at least.
     assert array_of(gradient)[:300] == pytest.approx(along @ index_from_mm[:3, :3], abs=3e-5)
-    assert (array_of(gradient)[300] == 0).all()
+    # A trilinear value is linear along each axis of its cell: so its slope is the difference of the cell's two sides.
+    middle, within = np.clip(inside, 0, last), np.empty((300, 3))
+    cell = np.minimum(np.floor(middle), last - 1)
+    for axis in range(3):
+        low, high = middle.copy(), middle.copy()
+        low[:, axis], high[:, axis] = cell[:, axis], cell[:, axis] + 1
+        within[:, axis] = value(high) - value(low)
+    assert array_of(slope)[:300] == pytest.approx(within @ index_from_mm[:3, :3], abs=3e-5)
+    assert (array_of(gradient)[300] == 0).all() and (array_of(slope)[300] == 0).all()
 
 
 def test_a_volume_is_trilinear_between_voxels_and_ends_half_a_voxel_beyond(device):
