@@ -201,7 +201,7 @@ class Press(Section):
 
     After the warm-up, in which the organ settles on its support, the transducer's axis passes ``target_mm`` along
     ``direction``, with the image's lateral axis along ``lateral``. It starts where it just touches the organ and presses
-    to each of ``indentations_mm``.
+    to each of ``indentations_mm``, by default within the default ``compression_warning_mm``.
     """
 
     target_mm: Vector3 | None = None
@@ -209,7 +209,7 @@ class Press(Section):
     lateral: Direction | None = None
     warm_up_steps: int = Field(120, ge=0, le=100000)
     stage_steps: int = Field(90, ge=1, le=100000)
-    indentations_mm: tuple[Annotated[float, Field(ge=0, le=40)], ...] = (5.95, 9.48, 12.38)
+    indentations_mm: tuple[Annotated[float, Field(ge=0, le=40)], ...] = (2.0, 4.0, 6.0)
 
 
 class Scene(Section):

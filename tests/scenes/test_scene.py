@@ -19,6 +19,7 @@ from scenes.scene import (
     Scene,
     SceneError,
     SolverSection,
+    Transducer,
     load_scene,
     scene_file,
     scene_text,
@@ -210,6 +211,8 @@ def test_a_press_left_open_goes_with_gravity_through_the_tumour(tmp_path):
     press = press_on(Press(), anatomy, np.array([0.0, 1.0, 0.0]))
     assert press.target_mm == pytest.approx((0, 0, 0), abs=1e-6)
     assert press.direction == (0.0, 1.0, 0.0)
+    # With what the organ's own weight adds.
+    assert max(press.indentations_mm) + 1 < Transducer().compression_warning_mm
     given = Press(target_mm=(1, 2, 3), direction=(0, 0, -2), lateral=(1, 0, 0))
     kept = press_on(given, anatomy, np.array([0.0, 1.0, 0.0]))
     assert kept.target_mm == (1, 2, 3) and kept.direction == (0, 0, -1) and kept.lateral == (1, 0, 0)
