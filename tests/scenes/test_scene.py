@@ -90,6 +90,17 @@ def refused(tmp_path: Path, text: str) -> str:
             "[anatomy]\ntumour = 't.stl'\n[tissue.parts.tumour]\npoisson = 0.5",
             "tissue.parts.tumour.poisson = 0.5: input should be less than or equal to 0.4999",
         ),
+        ("[anatomy]\n[tissue]\nyoung_kpa = '15'", "tissue.young_kpa = '15': input should be a valid number"),
+        ("[anatomy]\n[solver]\niterations = '4'", "solver.iterations = '4': input should be a valid integer"),
+        (
+            "[anatomy]\n[contact]\nparticles = 'yes'",
+            "contact.particles = 'yes': input should be a valid boolean",
+        ),
+        ("[anatomy]\n[trocar]\nat_mm = [0, '1', 2]", "trocar.at_mm.1 = '1': input should be a valid number"),
+        (
+            "[anatomy]\n[[tissue.prony]]\nmodulus_ratio = true\ntime_s = 1",
+            "prony.0.modulus_ratio = True: input",
+        ),
         ("[anatomy]\n[[shape]]\nkind = 'ball'", "'plane', 'mesh', 'sdf'"),
         ("[anatomy]\n[organs]\n", "organs: unknown key"),
         ("nephron_scene = 3\n[brain]\n", "nephron_scene = 3: written by Nephron 3, and this is Nephron 2"),
