@@ -103,6 +103,10 @@ def refused(tmp_path: Path, text: str) -> str:
         ),
         ("[anatomy]\n[[shape]]\nkind = 'ball'", "'plane', 'mesh', 'sdf'"),
         ("[anatomy]\n[organs]\n", "organs: unknown key"),
+        (
+            "[anatomy]\nphantm = 1\n[tissue]\nyoung_kpa = 0\npoison = 0",
+            "(and 2 more: tissue.poison, tissue.young_kpa)",
+        ),
         ("nephron_scene = 3\n[brain]\n", "nephron_scene = 3: written by Nephron 3, and this is Nephron 2"),
         ("nephron_scene = 'two'\n[anatomy]\n", "nephron_scene = 'two': expected 2"),
         ("[anatomy\n", "; expected a scene file (TOML) or a patient's folder"),
