@@ -19,7 +19,7 @@ from rehearsal.resection.resection_plan import (
     is_resection_plan,
     read_resection_plan,
 )
-from rehearsal.sessions.session_file import Log, SessionError, read_log, scene_of_log
+from rehearsal.sessions.session_file import Log, SessionError, read_log, scene_of_log, settings_apart
 from rehearsal.tracking.pose_file import TimedPoses
 from rehearsal.tracking.track_file import check_near, load_track
 from render.keys import Keys, load_keys
@@ -113,13 +113,22 @@ def session_of(path: Path, at_s: float) -> Log:
 
 
 def as_recorded(log: Log, scene: Scene) -> tuple[Scene, Probe]:
-    """The patient of a scene with all other settings of a session, and the session's probe. Raises SessionError."""
+    """The patient of a scene with all other settings of a session, and the session's probe; prints where these differ from the scene's.
+
+    Raises SessionError.
+    """
     try:
-        return scene_of_log(log.header, scene), probe_of_values(log.header.probe)
+        recorded, probe = scene_of_log(log.header, scene), probe_of_values(log.header.probe)
     except ValidationError as error:
         raise SessionError(f"the session's scene cannot be used: {explained(error)}") from None
     except ProbeError as error:
         raise SessionError(f"the session's probe cannot be used: {error}") from None
+    click.echo(
+        f"Replay of {log.length_s:.1f} s on the anatomy of: {scene.title or 'a scene without a title'}"
+    )
+    if apart := settings_apart(recorded, scene):
+        click.echo(f"With the settings of the session, which are not the scene's: {', '.join(apart)}")
+    return recorded, probe
 
 
 def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:
