@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 from pydantic import ValidationError
+from scipy.spatial import cKDTree
 
 from errors import explained
 from rehearsal.commands.command_line import CommandError
@@ -27,6 +29,9 @@ from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.import_findings import open_warnings
 from scenes.scene import Scene, load_scene, scene_file, with_options
 from ultrasound.probe import Probe, ProbeError, probe_of_values
+
+# Between passes the probe moves around the organ, farther off the longer its housing is (up to 500 mm); no pose of a plan is farther than this.
+MOST_OFF_MM = 1000.0
 
 
 @dataclass(frozen=True)
@@ -78,17 +83,18 @@ def check_anatomy(files: AskedFiles, asked: RehearseOptions, anatomy: LoadedAnat
             f"{files.scene.uncertainty}: is of other anatomy than this scene; make it anew with: app.py study uncertainty, or leave "
             "uncertainty out"
         )
+    plans = [] if files.plan is None else [files.plan]
     if files.track is not None and asked.track is not None:
         check_near(files.track, anatomy.organ.vertices, asked.track)
-        if is_plan(asked.track):
-            check_plan(read_plan(asked.track), fingerprint(anatomy), files.probe)
+        plans += [read_plan(asked.track)] if is_plan(asked.track) else []
+    for plan in plans:
+        check_plan(plan, fingerprint(anatomy), files.probe)
+        check_reach(plan, anatomy.organ.vertices)
     if files.resection_plan is not None and files.resection_plan.anatomy != fingerprint(anatomy):
         raise ResectionPlanError(
             "the plan of the resection is for other anatomy than this scene: name its scene or patient's folder before --plan; a patient "
             "imported again counts as another"
         )
-    if files.plan is not None:
-        check_plan(files.plan, fingerprint(anatomy), files.probe)
 
 
 def as_asked(scene: Scene, asked: RehearseOptions) -> tuple[Scene, Probe]:
@@ -144,6 +150,21 @@ def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:
         raise PlanError(
             f"the plan is for the probe {planned}, found {found}: choose it with --probe, or plan anew"
         )
+
+
+def check_reach(plan: Plan, organ: np.ndarray) -> None:
+    """Raises PlanError where a pose of a plan, of its passes or between them, is far from an organ's vertices (n, 3) [mm, LPS]."""
+    tree = cKDTree(organ)
+    for number, sweep in enumerate(plan.sweeps, 1):
+        for kind, lists in (("pass", sweep.passes), ("transfer", sweep.transfers)):
+            for place, poses in enumerate(lists, 1):
+                off_mm = tree.query(np.array(poses)[:, :3, 3])[0]
+                worst = int(off_mm.argmax())
+                if off_mm[worst] > MOST_OFF_MM:
+                    raise PlanError(
+                        f"the plan's sweep {number}, {kind} {place}, pose {worst + 1} is {off_mm[worst]:.0f} mm from the organ: expected "
+                        f"at most {MOST_OFF_MM:g} mm; the file was changed, plan anew with: app.py plan"
+                    )
 
 
 def _probe_name(name: Any, housing_mm: Any) -> str:
