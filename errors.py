@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 # How what was found is written: as Python has it, but never a whole matrix or file.
 FOUND = reprlib.Repr()
 FOUND.maxlist, FOUND.maxstring = 4, 80
+# Wrong keys of a file that a message names besides the first.
+MOST_NAMED = 4
 
 
 class UserError(ValueError):
@@ -44,7 +46,7 @@ def explained(
     unknown: Callable[[list[str]], str] = lambda where: "unknown key",
     tags: Collection[str] = (),
 ) -> str:
-    """The first problem in a line: the key, what was found, what was expected, and how many more there are.
+    """The first problem in a line: the key, what was found, what was expected, and the other keys that are wrong.
 
     ``unknown`` suggests what the writer of an unknown key, given by its place, may have meant. ``tags`` are the kinds of a union, which
     pydantic names among the keys. A validator's own message that begins with its key is left as it is.
@@ -53,8 +55,9 @@ def explained(
     # A key that is missing under one spelling and unknown under another is one mistake: name the unknown one.
     problems.sort(key=lambda problem: problem["type"] != "extra_forbidden")
     first = problems[0]
-    where = [str(part) for part in first["loc"] if part not in tags]
-    name, message = ".".join(where), first["msg"][0].lower() + first["msg"][1:]
+    places = [[str(part) for part in problem["loc"] if part not in tags] for problem in problems]
+    where, names = places[0], [".".join(place) for place in places]
+    name, message = names[0], first["msg"][0].lower() + first["msg"][1:]
     if first["type"] == "value_error":
         message = str(first["ctx"]["error"])
     if first["type"] == "extra_forbidden":
@@ -67,8 +70,9 @@ def explained(
         text = message if message.startswith(name) else f"{name}: {message}"
     else:
         text = f"{name} = {FOUND.repr(first['input'])}: {message}"
-    more = len(problems) - 1
-    return text + (f" (and {more} more)" if more else "")
+    more = list(dict.fromkeys(each for each in names if each != name))
+    others = ", ".join(more[:MOST_NAMED]) + (", ..." if len(more) > MOST_NAMED else "")
+    return text + (f" (and {len(more)} more: {others})" if more else "")
 
 
 def meant(key: str, known: Iterable[str]) -> str:

@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 from pydantic import ValidationError
+from scipy.spatial import cKDTree
 
 from errors import explained
 from rehearsal.commands.command_line import CommandError
@@ -19,7 +21,7 @@ from rehearsal.resection.resection_plan import (
     is_resection_plan,
     read_resection_plan,
 )
-from rehearsal.sessions.session_file import Log, SessionError, read_log, scene_of_log
+from rehearsal.sessions.session_file import Log, SessionError, read_log, scene_of_log, settings_apart
 from rehearsal.tracking.pose_file import TimedPoses
 from rehearsal.tracking.track_file import check_near, load_track
 from render.keys import Keys, load_keys
@@ -27,6 +29,9 @@ from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.import_findings import open_warnings
 from scenes.scene import Scene, load_scene, scene_file, with_options
 from ultrasound.probe import Probe, ProbeError, probe_of_values
+
+# Between passes the probe moves around the organ, farther off the longer its housing is (up to 500 mm); no pose of a plan is farther than this.
+MOST_OFF_MM = 1000.0
 
 
 @dataclass(frozen=True)
@@ -78,17 +83,18 @@ def check_anatomy(files: AskedFiles, asked: RehearseOptions, anatomy: LoadedAnat
             f"{files.scene.uncertainty}: is of other anatomy than this scene; make it anew with: app.py study uncertainty, or leave "
             "uncertainty out"
         )
+    plans = [] if files.plan is None else [files.plan]
     if files.track is not None and asked.track is not None:
         check_near(files.track, anatomy.organ.vertices, asked.track)
-        if is_plan(asked.track):
-            check_plan(read_plan(asked.track), fingerprint(anatomy), files.probe)
+        plans += [read_plan(asked.track)] if is_plan(asked.track) else []
+    for plan in plans:
+        check_plan(plan, fingerprint(anatomy), files.probe)
+        check_reach(plan, anatomy.organ.vertices)
     if files.resection_plan is not None and files.resection_plan.anatomy != fingerprint(anatomy):
         raise ResectionPlanError(
             "the plan of the resection is for other anatomy than this scene: name its scene or patient's folder before --plan; a patient "
             "imported again counts as another"
         )
-    if files.plan is not None:
-        check_plan(files.plan, fingerprint(anatomy), files.probe)
 
 
 def as_asked(scene: Scene, asked: RehearseOptions) -> tuple[Scene, Probe]:
@@ -113,13 +119,22 @@ def session_of(path: Path, at_s: float) -> Log:
 
 
 def as_recorded(log: Log, scene: Scene) -> tuple[Scene, Probe]:
-    """The patient of a scene with all other settings of a session, and the session's probe. Raises SessionError."""
+    """The patient of a scene with all other settings of a session, and the session's probe; prints where these differ from the scene's.
+
+    Raises SessionError.
+    """
     try:
-        return scene_of_log(log.header, scene), probe_of_values(log.header.probe)
+        recorded, probe = scene_of_log(log.header, scene), probe_of_values(log.header.probe)
     except ValidationError as error:
         raise SessionError(f"the session's scene cannot be used: {explained(error)}") from None
     except ProbeError as error:
         raise SessionError(f"the session's probe cannot be used: {error}") from None
+    click.echo(
+        f"Replay of {log.length_s:.1f} s on the anatomy of: {scene.title or 'a scene without a title'}"
+    )
+    if apart := settings_apart(recorded, scene):
+        click.echo(f"With the settings of the session, which are not the scene's: {', '.join(apart)}")
+    return recorded, probe
 
 
 def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:
@@ -135,6 +150,21 @@ def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:
         raise PlanError(
             f"the plan is for the probe {planned}, found {found}: choose it with --probe, or plan anew"
         )
+
+
+def check_reach(plan: Plan, organ: np.ndarray) -> None:
+    """Raises PlanError where a pose of a plan, of its passes or between them, is far from an organ's vertices (n, 3) [mm, LPS]."""
+    tree = cKDTree(organ)
+    for number, sweep in enumerate(plan.sweeps, 1):
+        for kind, lists in (("pass", sweep.passes), ("transfer", sweep.transfers)):
+            for place, poses in enumerate(lists, 1):
+                off_mm = tree.query(np.array(poses)[:, :3, 3])[0]
+                worst = int(off_mm.argmax())
+                if off_mm[worst] > MOST_OFF_MM:
+                    raise PlanError(
+                        f"the plan's sweep {number}, {kind} {place}, pose {worst + 1} is {off_mm[worst]:.0f} mm from the organ: expected "
+                        f"at most {MOST_OFF_MM:g} mm; the file was changed, plan anew with: app.py plan"
+                    )
 
 
 def _probe_name(name: Any, housing_mm: Any) -> str:

@@ -150,13 +150,14 @@ class RehearsalRun:
         )
 
     def _replayed_steps(self, replay: Replay) -> int:
-        steps = len(replay.log.poses) - replay.session.step_index
+        steps, seconds = len(replay.log.poses) - replay.session.step_index, self.asked.seconds
         if steps == 0:
             raise CommandError(
                 f"the session has nothing after {self.asked.at:g} s: it is {replay.log.length_s:.1f} s long"
             )
-        seconds = self.asked.seconds
-        return steps if not seconds else min(steps, max(1, round(seconds / self._step_s)))
+        if seconds is None:
+            return steps
+        return max(1, replay.log.step_at(replay.time_s + seconds) - replay.session.step_index)
 
     def _tracked_input(self, track: TimedPoses) -> tuple[InputSource, int]:
         length_s = min(self.asked.seconds or np.inf, track.length_s)

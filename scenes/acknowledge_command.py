@@ -1,11 +1,13 @@
 """The command ``acknowledge``: marks the warnings of an import as checked by the user."""
 
+import sys
 from pathlib import Path
 
 import click
 
 from scenes.import_findings import acknowledge, read_findings
 from scenes.scene import SceneError, scene_file
+from scenes.terminal import shell_command
 
 
 @click.command("acknowledge")
@@ -26,6 +28,16 @@ def acknowledge_command(patient: Path, yes: bool) -> None:
     for text in findings.open_warnings:
         click.echo(f"WARNING of the import: {text}")
     if not yes:
-        click.confirm(f"Did you check this in {folder / 'check.png'}?", abort=True)
+        _ask(folder)
     acknowledge(folder, findings.open_warnings)
     click.echo("Acknowledged: no longer shown.")
+
+
+def _ask(folder: Path) -> None:
+    """Raises SceneError where nobody can answer, Abort for a no."""
+    if not sys.stdin.isatty():
+        raise SceneError(
+            f"not acknowledged: there is no terminal to ask in; check {folder / 'check.png'}, then: "
+            f"{shell_command('acknowledge', folder, '--yes')}"
+        )
+    click.confirm(f"Did you check this in {folder / 'check.png'}?", abort=True)

@@ -46,6 +46,11 @@ class KidneyAxes:
     """Whether both pairs of lines come from the hilar concavity, because no sinus is labelled."""
 
     @property
+    def length_mm(self) -> float:
+        """From pole to pole, along the polar axis, without lesions."""
+        return float(np.ptp(self.heights(self.contour.vertices)))
+
+    @property
     def anterior(self) -> np.ndarray | None:
         """Normal of the kidney's own coronal plane, through polar axis and hilum; to the front."""
         if self.hilar is None:

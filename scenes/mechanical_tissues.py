@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator
 
-from scenes.section import Section
+from scenes.section import LIST, Section
 
 TABLE = Path(__file__).parent / "mechanical_tissues.toml"
 
@@ -18,7 +18,7 @@ def _ascending(values: tuple[float, float, float]) -> tuple[float, float, float]
     return values
 
 
-Range = Annotated[tuple[float, float, float], AfterValidator(_ascending)]
+Range = Annotated[tuple[float, float, float], LIST, AfterValidator(_ascending)]
 
 
 class PartProperties(Section):

@@ -14,7 +14,7 @@ import tomli_w
 from pydantic import AliasChoices, Field, ValidationError, model_validator
 
 from errors import UserError, explained, meant
-from scenes.section import Direction, Length, Section, Vector3
+from scenes.section import LIST, Direction, Length, Section, Vector3
 from scenes.tissue import TISSUES, NeoHookeanTissue, Tissue
 from version import FORMAT, of_this_format
 
@@ -149,6 +149,9 @@ class DistanceShape(Section):
     file: str
 
 
+Shape = Annotated[PlaneShape | MeshShape | DistanceShape, Field(discriminator="kind")]
+
+
 class Transducer(Section):
     """A probe: the name of one in ``ultrasound/probes``, or of a file in the scene's folder; it moves at ``speed_mm_s`` at most.
 
@@ -157,7 +160,7 @@ class Transducer(Section):
     """
 
     probe: str = "linear"
-    size_mm: tuple[Length, Length, Length] | None = None
+    size_mm: Annotated[tuple[Length, Length, Length], LIST] | None = None
     speed_mm_s: float = Field(150.0, gt=0, le=2000)
     compression_warning_mm: float = Field(8.0, gt=0, le=100)
 
@@ -201,7 +204,7 @@ class Press(Section):
 
     After the warm-up, in which the organ settles on its support, the transducer's axis passes ``target_mm`` along
     ``direction``, with the image's lateral axis along ``lateral``. It starts where it just touches the organ and presses
-    to each of ``indentations_mm``.
+    to each of ``indentations_mm``, by default within the default ``compression_warning_mm``.
     """
 
     target_mm: Vector3 | None = None
@@ -209,7 +212,7 @@ class Press(Section):
     lateral: Direction | None = None
     warm_up_steps: int = Field(120, ge=0, le=100000)
     stage_steps: int = Field(90, ge=1, le=100000)
-    indentations_mm: tuple[Annotated[float, Field(ge=0, le=40)], ...] = (5.95, 9.48, 12.38)
+    indentations_mm: Annotated[tuple[Annotated[float, Field(ge=0, le=40)], ...], LIST] = (2.0, 4.0, 6.0)
 
 
 class Scene(Section):
@@ -224,7 +227,7 @@ class Scene(Section):
     gravity: Gravity = Gravity()
     contact: Contact = Contact()
     attachment: Attachment = Attachment()
-    shape: tuple[Annotated[PlaneShape | MeshShape | DistanceShape, Field(discriminator="kind")], ...] = ()
+    shape: Annotated[tuple[Shape, ...], LIST] = ()
     transducer: Transducer = Transducer()
     trocar: Trocar = Trocar()
     image: Image = Image()

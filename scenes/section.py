@@ -5,7 +5,9 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-Vector3 = tuple[float, float, float]
+# TOML and JSON have lists where Python has tuples.
+LIST = Field(strict=False)
+Vector3 = Annotated[tuple[float, float, float], LIST]
 Length = Annotated[float, Field(gt=0, le=500)]
 
 
@@ -19,6 +21,6 @@ Direction = Annotated[Vector3, AfterValidator(_not_zero)]
 
 
 class Section(BaseModel):
-    """Its keys are all that there are, and its values do not change."""
+    """Its keys are all that there are, and its values do not change. A text is no number."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)

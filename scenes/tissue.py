@@ -5,7 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, SerializeAsAny
 
-from scenes.section import Section
+from scenes.section import LIST, Section
 
 Stiffness = Annotated[float, Field(ge=0, le=1)]
 QUALITIES = ("fast", "balanced", "accurate")
@@ -83,7 +83,7 @@ class NeoHookeanTissue(TissueSection):
     density_g_cm3: float = Field(1.05, gt=0, le=20)
     parts: dict[PartName, PartMaterial] = Field(default_factory=dict)
     capsule_n_mm: float = Field(0.0, ge=0, le=100)
-    prony: tuple[Prony, ...] = Field((), max_length=3)
+    prony: Annotated[tuple[Prony, ...], LIST] = Field((), max_length=3)
 
 
 class ShapeMatchingTissue(TissueSection):

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 import click
 import numpy as np
 from pydantic import Field
-from tqdm import tqdm
 
 from rehearsal.commands.command_line import (
     ARGUMENT,
@@ -32,6 +31,7 @@ from rehearsal.reconstruction.sweep_volumes import (
 from rehearsal.result_files import write_json
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
+from scenes.terminal import bar, stages
 from ultrasound.reconstruction import METHODS
 from ultrasound.sweep import Sweep, load_constants
 from ultrasound.sweep_file import PROBE_FIELD, read_ground_truth, read_sweep, suffix_of, write_sweep
@@ -112,15 +112,21 @@ def reconstruct(asked: ReconstructOptions) -> None:
     places = None
     if asked.undo_compression and patient is not None:
         places = _compression_correction(patient, images, image_poses, reference, asked.arch)
-    with tqdm(total=len(image_poses.frames), desc="reconstruct", unit="image") as bar:
-        try:
-            mask = lit_pixels(images.images)
-            volumes = reconstruct_volumes(
-                images, image_poses, mask, **settings, labels=labels, places=places, progress=bar.update
-            )
-        except ValueError as error:
-            raise CommandError(f"{asked.sweep.name}: {error}") from None
-    save_volumes(volumes, out)
+    try:
+        mask = lit_pixels(images.images)
+        volumes = reconstruct_volumes(
+            images, image_poses, mask, **settings, labels=labels, places=places, progress=bar
+        )
+    except ValueError as error:
+        raise CommandError(f"{asked.sweep.name}: {error}") from None
+    with stages() as stage:
+        stage("Writing the volumes")
+        save_volumes(volumes, out)
+        save_slices_figure(volumes, out / "volume.png")
+        stage("Comparing with the patient")
+        agreement, fault = _metrics(volumes, patient)
+    if fault:
+        click.echo(fault)
     report = dict(
         version=VERSION,
         **settings,
@@ -129,9 +135,8 @@ def reconstruct(asked: ReconstructOptions) -> None:
         tracker=asdict(errors),
         **about,
         shape=list(volumes.box.shape),
-        agreement=_metrics(volumes, patient),
+        agreement=agreement,
     )
-    save_slices_figure(volumes, out / "volume.png")
     write_json(report, out / "report.json")
     click.echo(in_words(report))
     click.echo(f"Wrote volume.nrrd, volume.png and report.json to {out}")
@@ -179,9 +184,12 @@ def _describe(images: Sweep, image_poses: ImagePoses) -> dict[str, Any]:
     )
 
 
-def _metrics(volumes: SweepVolumes, patient: tuple[Scene, LoadedAnatomy] | None) -> dict[str, Any]:
+def _metrics(
+    volumes: SweepVolumes, patient: tuple[Scene, LoadedAnatomy] | None
+) -> tuple[dict[str, Any], str]:
+    """The segmentation metrics of organ and tumour, or why there are none."""
     if patient is None or not volumes.regions:
-        return {}
+        return {}, ""
     from rehearsal.reconstruction.patient_comparison import are_apart, compare_with_surfaces, surfaces_of
 
     surfaces = surfaces_of(patient[1])
@@ -189,16 +197,14 @@ def _metrics(volumes: SweepVolumes, patient: tuple[Scene, LoadedAnatomy] | None)
         # A box that encloses both could exceed the memory.
         found = {} if are_apart(volumes.box, surfaces["organ"]) else compare_with_surfaces(volumes, surfaces)
     except ValueError as error:
-        click.echo(f"Not compared with the whole organ: {error}")
-        return {}
+        return {}, f"Not compared with the whole organ: {error}"
     scanned = found["organ"]["scanned"] if "organ" in found else 0.0
     if scanned < LEAST_SCANNED:
-        click.echo(
+        return {}, (
             f"Not compared: the sweep covers {100 * scanned:.1f} % of this organ, so it is of another organ or patient. Name its own "
             "scene with --scene."
         )
-        return {}
-    return found
+    return found, ""
 
 
 def in_words(report: dict[str, Any]) -> str:

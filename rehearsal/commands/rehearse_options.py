@@ -62,11 +62,11 @@ class RehearseOptions(LinkOptions, ImageOptions, QualityOptions, ArchOptions):
     no_pictures: bool = False
     """With --headless: no images, which take most of the time; only report, surfaces and session."""
     seconds: float | None = Field(None, ge=0.02, le=3600)
-    """Simulated seconds without a window [the scene's press]; the scripted press takes this time; a replay or a track stops then."""
+    """Simulated seconds without a window [the scene's press]; the scripted press takes this time; a track stops then, a replay so long after --at."""
     replay: Path | None = None
     """Replay a recorded session of this SCENE, bit for bit."""
     at: float = Field(0.0, ge=0)
-    """With --replay: start at this second."""
+    """With --replay: start at this second of the session."""
     track: Path | None = None
     """Recorded poses that move the probe: a tracked sweep (.igs.mha, .igs.nrrd), or poses with times (CSV, JSON)."""
     track_from: str | None = None

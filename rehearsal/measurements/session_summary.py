@@ -92,8 +92,8 @@ def summary_text(summary: dict[str, Any]) -> str:
         [
             f"session     {summary['duration_s']:.1f} s, {counted(summary['presses'], 'press')}, the path of the transducer "
             f"{summary['path_mm']:.0f} mm, at most {summary['fastest_mm_s']:.0f} mm/s; {counted(summary['bookmarks'], 'bookmark')}",
-            f"compression {summary['compression_max_mm']:.1f} mm at most; {summary['over_warning_s']:.1f} s above the limit of "
-            f"{summary['compression_warning_mm']:g} mm",
+            f"compression {summary['compression_max_mm']:.1f} mm at most, also by the organ's own weight; "
+            f"{summary['over_warning_s']:.1f} s above the limit of {summary['compression_warning_mm']:g} mm",
             *_force(summary["force_max_n"]),
             f"coverage    {seen or 'none: there is no CT'}{largest}",
         ]

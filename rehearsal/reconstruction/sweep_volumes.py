@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.ndimage import binary_erosion, find_objects
 
+from scenes.terminal import Progress, silent
 from ultrasound.reconstruction import Reconstruction, VoxelBox
 from ultrasound.sweep import PixelLabel, Sweep, SweepError
 
@@ -74,12 +75,12 @@ def reconstruct_volumes(
     labels: Sweep | None = None,
     places: Places | None = None,
     with_grey: bool = True,
-    progress: Callable[[], object] = lambda: None,
+    progress: Progress = silent,
 ) -> SweepVolumes:
     """Reconstruct volumes from the images of a sweep.
 
     ``labels`` are the same frames with ``PixelLabel`` values. ``places`` is called with the frames in order; without it the pixels are where
-    the tracked poses place them. Without grey values there must be labels. ``progress`` is called after each frame.
+    the tracked poses place them. Without grey values there must be labels. ``progress`` shows the progress over frames and volumes.
 
     Raises SweepError where labels and images do not match, ValueError as ``VoxelBox.around``.
     """
@@ -99,7 +100,7 @@ def reconstruct_volumes(
         channels.pop(GREY)
     reconstructions = {name: Reconstruction(box, method) for name in channels}
     beads = _Beads(mask)
-    for k, frame in enumerate(image_poses.frames):
+    for k, frame in enumerate(progress(image_poses.frames, "images")):
         at = None if places is None else places(int(frame))
         for name, is_of in channels.items():
             values = sweep.images[frame] if is_of is None else is_of(labels.images[frame])  # type: ignore[union-attr]
@@ -110,8 +111,9 @@ def reconstruct_volumes(
         if labels is not None:
             is_end = k in (0, len(image_poses.frames) - 1)
             beads.add(labels.images[frame], image_poses.matrices[k], at, is_end)
-        progress()
-    volumes = {name: each.volume(reach_mm) for name, each in reconstructions.items()}
+    volumes = {
+        name: reconstructions[name].volume(reach_mm) for name in progress([*reconstructions], "fill holes")
+    }
     known = next(iter(volumes.values()))[1]
     grey = volumes.pop(GREY)[0] if with_grey else np.zeros(box.shape, np.float32)
     regions = {name: values > HALF for name, (values, _) in volumes.items()}

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from typing_extensions import TypedDict
 
-from errors import UserError, explained
+from errors import FOUND, UserError, explained
 from rehearsal.resection.resection_state import MOST_MARKS
 from rehearsal.sessions.packed_arrays import Seen, SeenVoxels, unpack_lengths, unpack_poses
 from render.viewer import Technique
@@ -250,3 +250,17 @@ def scene_of_log(header: Header, scene: Scene) -> Scene:
         own = values.get("transducer", {}).get("probe")
         recorded["transducer"] = kept | ({"probe": own} if own else {})
     return Scene.model_validate(values | recorded)
+
+
+def settings_apart(recorded: Scene, present: Scene) -> list[str]:
+    """The settings of a session that are not its scene's, each in words; of a table only the name."""
+    then, now = recorded_values(recorded), recorded_values(present)
+    found = []
+    for section in [name for name, values in then.items() if isinstance(values, dict)]:
+        for key, value in then[section].items():
+            there = now[section].get(key)
+            if value != there:
+                is_table = isinstance(value, dict)
+                values = "" if is_table else f" {FOUND.repr(value)} (scene: {FOUND.repr(there)})"
+                found.append(f"{section}.{key}{values}")
+    return found

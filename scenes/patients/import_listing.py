@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tabulate import tabulate
@@ -35,21 +36,20 @@ def listing_text(ct: Path, labels: Sequence[Path] = (), progress: Progress = sil
 def _series_table(listed: CtListing) -> str:
     if not listed.series:
         return "no CT series"
-    rows = [_series_row(row) for row in listed.series]
     several = len({row.patient for row in listed.series}) > 1
-    shown = [n for n, head in enumerate(SERIES_HEADS) if head != "patient" or several]
-    return tabulate(
-        [[row[n] for n in shown] for row in rows],
-        [SERIES_HEADS[n] for n in shown],
-        disable_numparse=True,
-        colalign=["left"] * len(shown),
-    )
+    return _table([_series_row(row, several) for row in listed.series], SERIES_HEADS, disable_numparse=True)
 
 
-def _series_row(row: SeriesRow) -> tuple[str, ...]:
+def _table(rows: Sequence[tuple], heads: Sequence[str], **options: Any) -> str:
+    """Rows as text, without the columns that are empty in all of them."""
+    shown = [n for n in range(len(heads)) if any(row[n] not in (None, "") for row in rows)]
+    return tabulate([[row[n] for n in shown] for row in rows], [heads[n] for n in shown], **options)
+
+
+def _series_row(row: SeriesRow, several: bool) -> tuple[str, ...]:
     spacing = "" if row.spacing_mm is None else f"{row.spacing_mm:.2f}"
     pixels = "" if row.pixel_mm is None else "{:.2f} x {:.2f}".format(*row.pixel_mm)
-    extent, patient = f"{row.extent_mm:.0f}", str(row.patient)
+    extent, patient = f"{row.extent_mm:.0f}", str(row.patient) if several else ""
     return _name(row), str(row.slices), spacing, pixels, extent, row.orientation, patient
 
 
@@ -74,7 +74,7 @@ def _labels_text(path: Path, progress: Progress) -> str:
         return of_dicom
     maps = open_labels(path, progress=progress).maps(AS_THEY_ARE)
     rows = [row for one in maps for row in _segment_rows(one)]
-    return f"{path.name}:\n" + tabulate(rows, SEGMENT_HEADS, floatfmt=".1f")
+    return f"{path.name}:\n" + _table(rows, SEGMENT_HEADS, floatfmt=".1f")
 
 
 def _dicom_labels(path: Path, progress: Progress) -> str:

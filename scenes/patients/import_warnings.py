@@ -85,13 +85,26 @@ def stone_warnings(
     if not parenchyma.any():
         return ()
     bright = hounsfield > np.median(hounsfield[parenchyma]) + STONE_ABOVE_MEDIAN_HU
-    found_ml = float((bright & parenchyma & ~ndimage.binary_dilation(urine)).sum() * grid.voxel_ml)
+    bright &= parenchyma & ~ndimage.binary_dilation(urine)
+    found_ml, share = float(bright.sum() * grid.voxel_ml), bright.sum() / parenchyma.sum()
     if found_ml < LEAST_STONE_ML:
         return ()
     return (
-        f"{found_ml:.1f} ml inside the organ are as bright as stone or contrast agent; in the B-mode image they are bright and cast shadows; if they "
-        "are contrast agent in the collecting system, label it (--collecting), or use a CT of the portal-venous or nephrographic phase",
+        f"{found_ml:.1f} ml inside the organ ({share:.1%} of it) are as bright as stone or contrast agent, {_largest_piece(grid, bright, parenchyma)}; "
+        "in the B-mode image they are bright and cast shadows; if they are contrast agent, label where it is (--collecting, --vessels), or use a CT of "
+        "the portal-venous or nephrographic phase",
     )
+
+
+def _largest_piece(grid: VoxelGrid, bright: np.ndarray, organ: np.ndarray) -> str:
+    """Where the largest connected piece of some voxels (z, y, x) of an organ is, in words."""
+    pieces, _ = ndimage.label(bright, np.ones((3, 3, 3)))
+    piece = pieces == np.bincount(pieces[bright]).argmax()
+    places, heights = (grid.place(np.argwhere(voxels)[:, ::-1]) for voxels in (piece, organ))
+    x, y, z = places.mean(axis=0)
+    low, high = heights[:, 2].min(), heights[:, 2].max()
+    third = ("lower", "middle", "upper")[min(int(3 * (z - low) / max(high - low, 1e-9)), 2)]
+    return f"the largest piece {piece.sum() * grid.voxel_ml:.1f} ml in the {third} third, at {x:.0f}, {y:.0f}, {z:.0f} mm (LPS)"
 
 
 def label_warnings(labels: LabelMap, piece: Organ, is_named: bool) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 """A plan's file, and what is refused of plans and of the command lines that make and follow them."""
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from plan_ball import ORIGIN, plan_of, straight_pass, sweep_of
 from pydantic import ValidationError
 
 import app
-from rehearsal.asked_files import check_plan
+from rehearsal.asked_files import check_plan, check_reach
 from rehearsal.commands.plan_command import PlanOptions, trocar_of
 from rehearsal.planning import trial_workers
 from rehearsal.planning.plan_file import (
@@ -159,6 +160,19 @@ def test_a_plan_is_followed_only_on_its_anatomy_with_its_probe():
         check_plan(plan, plan.anatomy, probe.model_copy(update=dict(housing_mm=(40.0, 10.0, 21.0))))
     with pytest.raises(PlanError, match="for the probe None"):
         check_plan(plan_of(probe={}), plan.anatomy, probe)
+
+
+@pytest.mark.parametrize("far_mm", [900.0, 2000.0])
+def test_a_pose_far_from_the_organ_is_refused_by_its_number(far_mm):
+    near, far = straight_pass(3), straight_pass(3)
+    far[1, :3, 3] += [0, 0, far_mm]
+    check_reach(plan_of(sweep_of(near, near)), ORIGIN[None])
+    with (
+        nullcontext()
+        if far_mm < 1000
+        else pytest.raises(PlanError, match=r"sweep 2, pass 2, pose 2 is 2000 mm")
+    ):
+        check_reach(plan_of(sweep_of(near), sweep_of(near, far)), ORIGIN[None])
 
 
 # As a track

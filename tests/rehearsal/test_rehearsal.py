@@ -182,7 +182,7 @@ def test_every_feature_at_once_without_a_ct_stays_finite_and_out_of_everything(o
         gravity=dict(direction=(0, 0, -1)),
         contact=dict(particles=True),
         shape=(dict(kind="sdf", file="bed.nrrd"), dict(kind="plane", normal=(0, 0.2, 1), offset_mm=-21.0)),
-        press=dict(direction=(0.2, 0, -1), warm_up_steps=20),
+        press=dict(direction=(0.2, 0, -1), warm_up_steps=20, indentations_mm=(5.95, 9.48, 12.38)),
     )
     rehearsal = Rehearsal(scene, load_anatomy(scene, tmp_path))
     assert rehearsal.model.relaxation == "global"

@@ -34,6 +34,7 @@ from rehearsal.sessions.session_file import (
     SessionError,
     read_log,
     scene_of_log,
+    settings_apart,
 )
 from render.viewer import Controls, Settings
 from scenes.anatomy import LoadedAnatomy
@@ -432,6 +433,8 @@ def test_the_scene_of_a_session_is_the_patients_with_all_else_as_recorded(tmp_pa
     scene = scene_of_log(read_log(recorded_at(tmp_path, ball).path).header, embedded)
     assert scene.tissue.cell_mm == 7.0 != embedded.tissue.cell_mm
     assert (scene.anatomy, scene.shape, scene.title) == (embedded.anatomy, embedded.shape, embedded.title)
+    assert "tissue.cell_mm 7.0 (scene: 3.5)" in settings_apart(scene, embedded)
+    assert settings_apart(embedded, embedded) == []
 
 
 @pytest.mark.parametrize("own", [load_scene(EMBEDDED), Scene(anatomy={"phantom": True})])

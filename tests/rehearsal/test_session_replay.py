@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from rehearsal.sessions import recorder
 from rehearsal.sessions.open_session import open_session
 from rehearsal.sessions.packed_arrays import pack_seen
 from rehearsal.sessions.replay import Replay
-from rehearsal.sessions.session_file import Log, SessionError, read_log
+from rehearsal.sessions.session_file import Header, Log, SessionError, read_log
 from rehearsal.tracking.pose_file import TimedPoses
 from render.keys import Keys
 from render.viewer import Controls, Settings, View
@@ -226,6 +227,15 @@ def test_a_tracked_file_is_followed_headless_and_replayed(built, monkeypatch, tm
     told = capsys.readouterr().out
     assert "identical in all 1 states" in told and "no images" in told and "per image" not in told
     assert sorted(path.name for path in (tmp_path / "bare").iterdir()) == FILES
+
+
+@pytest.mark.parametrize(("seconds", "steps"), [(None, 15), (0.4, 6), (0.02, 1), (9.0, 15)])
+def test_seconds_of_a_replay_are_counted_from_where_it_starts_in_the_recorded_lengths(seconds, steps):
+    header = Header(anatomy="", scene={}, probe={}, arch="cpu", time_step_s=1 / 60)
+    log = Log(header, np.zeros((20, 4, 4)), np.full(20, 1 / 15))
+    replay = SimpleNamespace(log=log, session=SimpleNamespace(step_index=5), time_s=5 / 15)
+    asked = SimpleNamespace(asked=RehearseOptions(seconds=seconds))
+    assert run.RehearsalRun._replayed_steps(asked, replay) == steps
 
 
 FILES = ["organ.ply", "report.json", "tumour.ply"]

@@ -32,6 +32,12 @@ def documented_imports() -> list[str]:
     return list(dict.fromkeys(re.split(r"\s+#", line)[0].strip() for line in found))
 
 
+def virtual_tumour() -> str:
+    """The code of the documents that writes tumour.stl."""
+    page = (ROOT / "docs" / "patients.md").read_text("utf-8")
+    return re.search(r'python -c "(import trimesh;[^"]*)"', page)[1]
+
+
 @pytest.fixture(scope="module")
 def clinic(tmp_path_factory):
     """A folder with all that the documents name."""
@@ -51,6 +57,7 @@ def clinic(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         coarsely(patch)
         patch.chdir(folder)
+        exec(virtual_tumour())
         assert main([*words_of("import ct kidneys.nii.gz --organ 1,2 --side left"), "--out", "bed"]) == 0
         shutil.copy(folder / "bed" / "support.stl", folder / "bed.stl")
         yield folder

@@ -89,9 +89,10 @@ def test_damaged_findings_are_named(folder, content, words):
 
 def test_the_command_asks_and_then_they_are_gone(folder, capfd, monkeypatch):
     monkeypatch.setattr("sys.stdin", open("/dev/null"))  # noqa: SIM115
-    assert main(["acknowledge", str(folder)]) == 130
-    printed = capfd.readouterr().out
-    assert all(f"WARNING of the import: {text}" in printed for text in TEXTS) and "check.png" in printed
+    assert main(["acknowledge", str(folder)]) == 2
+    printed, refused = capfd.readouterr()
+    assert all(f"WARNING of the import: {text}" in printed for text in TEXTS)
+    assert "check.png" in refused and refused.endswith(f"acknowledge {folder} --yes\n")
     assert open_warnings(files_scene(), folder) == TEXTS
     assert main(["acknowledge", str(folder), "--yes"]) == 0
     assert open_warnings(files_scene(), folder) == ()

@@ -29,7 +29,8 @@ def test_series_faults_and_labels_are_listed(tmp_path, capfd):
     assert any(line[:2] == ["7", "6"] for line in lines)
     assert "series 7 cannot be imported" in printed.out and "7.50 mm apart" in printed.out
     assert "seg.dcm: Kidney; of series 4" in printed.out
-    # Value and volume: two voxels of 1 ml, and one.
+    # Value and volume: two voxels of 1 ml, and one; no columns for names, which these labels lack.
+    assert ["value", "ml"] in lines
     assert ["1", "2.0"] in lines and ["2", "1.0"] in lines
     assert not any(value in printed.out + printed.err for value in PERSON.values() if len(value) > 3)
     assert {path.name for path in tmp_path.iterdir()} == {"ct", "map.nii.gz"}
@@ -60,5 +61,10 @@ def test_a_volume_file_beside_dicom_labels_is_the_ct(tmp_path, capfd):
 def test_a_path_without_anything_is_refused_in_words(tmp_path, capfd):
     assert main(["import", str(tmp_path), "--list"]) == 2
     assert "no DICOM file found" in capfd.readouterr().err
+    (tmp_path / "kidney.stl").write_bytes(b"solid")
+    assert main(["import", str(tmp_path), "--list"]) == 2
+    assert (
+        "surfaces, and no CT; expected a CT before them: python app.py import CT " in capfd.readouterr().err
+    )
     assert main(["import", str(tmp_path)]) == 2
     assert "--list" in capfd.readouterr().err

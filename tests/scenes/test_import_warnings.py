@@ -24,7 +24,11 @@ def test_as_bright_as_stone_is_what_the_echo_takes_for_one_and_no_speck(grid, ab
     hounsfield = np.full((10, 10, 10), KIDNEY_HU)
     hounsfield[2:][:edge, :edge, :edge] = KIDNEY_HU + STONE_ABOVE_MEDIAN_HU + above
     found = stone_warnings(grid, hounsfield, WHOLE, NOWHERE)
-    assert len(found) == lines and all("0.2 ml inside the organ" in line for line in found)
+    assert len(found) == lines
+    for line in found:
+        assert "0.2 ml inside the organ (2.7% of it)" in line
+        # The voxels 0 to 2 along x and y, 2 to 4 along z.
+        assert "the largest piece 0.2 ml in the middle third, at 2, 2, 6 mm (LPS)" in line
 
 
 def test_the_rim_of_urine_is_bright_where_voxels_are_cut(grid):

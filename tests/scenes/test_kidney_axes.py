@@ -53,6 +53,7 @@ def test_the_polar_axis_is_the_long_axis_towards_the_head(plain, turn):
     axes = kidney_axes(organ, [], {})
     assert angle_deg(axes.polar, turned @ [0, 0, 1]) < 0.5
     np.testing.assert_allclose(axes.centre, 7.0, atol=0.1)
+    assert axes.length_mm == pytest.approx(2 * HALF_AXES[2], rel=0.01)
     # Without sinus and hilum nothing else is known.
     assert axes.hilar is axes.anterior is axes.polar_lines is axes.sinus_lines is None
 

@@ -431,7 +431,8 @@ class TestWarnings:
         bright, marked = with_voxels(ct, voxels), with_voxels(labels, marks)
         (warning,) = imported(bright, marked, [2], margin_mm=20.0, tumour=[3], urine=[4]).warnings
         ml = stone.sum() * np.prod(ct.GetSpacing()) / 1000
-        assert f"{ml:.1f} ml inside the organ are as bright as stone" in warning and "--collecting" in warning
+        assert f"{ml:.1f} ml inside the organ (" in warning and "--collecting" in warning
+        assert f"{ml:.1f} ml in the upper third, at {LEFT[0][0]:.0f}," in warning
 
     def test_a_label_that_is_no_whole_kidney(self, ct_and_labels):
         """Hollow, and cut off above."""

@@ -19,6 +19,7 @@ from scenes.scene import (
     Scene,
     SceneError,
     SolverSection,
+    Transducer,
     load_scene,
     scene_file,
     scene_text,
@@ -89,8 +90,23 @@ def refused(tmp_path: Path, text: str) -> str:
             "[anatomy]\ntumour = 't.stl'\n[tissue.parts.tumour]\npoisson = 0.5",
             "tissue.parts.tumour.poisson = 0.5: input should be less than or equal to 0.4999",
         ),
+        ("[anatomy]\n[tissue]\nyoung_kpa = '15'", "tissue.young_kpa = '15': input should be a valid number"),
+        ("[anatomy]\n[solver]\niterations = '4'", "solver.iterations = '4': input should be a valid integer"),
+        (
+            "[anatomy]\n[contact]\nparticles = 'yes'",
+            "contact.particles = 'yes': input should be a valid boolean",
+        ),
+        ("[anatomy]\n[trocar]\nat_mm = [0, '1', 2]", "trocar.at_mm.1 = '1': input should be a valid number"),
+        (
+            "[anatomy]\n[[tissue.prony]]\nmodulus_ratio = true\ntime_s = 1",
+            "prony.0.modulus_ratio = True: input",
+        ),
         ("[anatomy]\n[[shape]]\nkind = 'ball'", "'plane', 'mesh', 'sdf'"),
         ("[anatomy]\n[organs]\n", "organs: unknown key"),
+        (
+            "[anatomy]\nphantm = 1\n[tissue]\nyoung_kpa = 0\npoison = 0",
+            "(and 2 more: tissue.poison, tissue.young_kpa)",
+        ),
         ("nephron_scene = 3\n[brain]\n", "nephron_scene = 3: written by Nephron 3, and this is Nephron 2"),
         ("nephron_scene = 'two'\n[anatomy]\n", "nephron_scene = 'two': expected 2"),
         ("[anatomy\n", "; expected a scene file (TOML) or a patient's folder"),
@@ -210,6 +226,8 @@ def test_a_press_left_open_goes_with_gravity_through_the_tumour(tmp_path):
     press = press_on(Press(), anatomy, np.array([0.0, 1.0, 0.0]))
     assert press.target_mm == pytest.approx((0, 0, 0), abs=1e-6)
     assert press.direction == (0.0, 1.0, 0.0)
+    # With what the organ's own weight adds.
+    assert max(press.indentations_mm) + 1 < Transducer().compression_warning_mm
     given = Press(target_mm=(1, 2, 3), direction=(0, 0, -2), lateral=(1, 0, 0))
     kept = press_on(given, anatomy, np.array([0.0, 1.0, 0.0]))
     assert kept.target_mm == (1, 2, 3) and kept.direction == (0, 0, -1) and kept.lateral == (1, 0, 0)

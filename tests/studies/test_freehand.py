@@ -98,9 +98,24 @@ def check_balls(rebuilt: SweepVolumes, off_mm: float) -> None:
 @pytest.mark.parametrize(("method", "off_mm"), [("smooth", 0.1), ("nearest", 0.5)])
 def test_balls_are_reconstructed_at_their_positions(marked, method, off_mm):
     # Nearest voxels are off by up to half of one, all to one side where pictures lie as evenly as the voxels.
+    shown: dict[str, int] = {}
+
+    def counted(things, title):
+        shown[title] = len(things)
+        return things
+
     rebuilt = reconstruct_volumes(
-        marked, image_poses_of(marked, "Reference"), ALL, 1.0, method, 2.0, marked, with_grey=False
+        marked,
+        image_poses_of(marked, "Reference"),
+        ALL,
+        1.0,
+        method,
+        2.0,
+        marked,
+        with_grey=False,
+        progress=counted,
     )
+    assert shown == {"images": len(marked), "fill holes": 2}
     check_balls(rebuilt, off_mm)
     assert sorted(rebuilt.beads) == [0, 1]
     # Some hundred pixels in a ball of 2 mm, of 0.5 x 0.8 x 0.8 mm: the mean of their middles is off by less than a tenth of one.

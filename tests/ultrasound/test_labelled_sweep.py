@@ -389,7 +389,7 @@ def test_reconstruct_takes_what_plus_wrote(data, tmp_path, capsys, sample, confi
     # Voxels are means of pixels.
     assert voxels.max() <= read_sweep(sweep).images.max()
     assert not (tmp_path / "labels.nrrd").exists()
-    assert f"{report['used']}/{report['used']}" in capsys.readouterr().err
+    assert f"images    {report['used']} of {report['used']} with a pose" in capsys.readouterr().out
 
 
 def test_poses_alone_make_no_volume(data, tmp_path):

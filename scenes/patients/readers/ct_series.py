@@ -26,7 +26,7 @@ from scenes.patients.readers.series_choice import (
 from scenes.patients.readers.slice_stack import stack_slices
 from scenes.patients.readers.volume_folder import only_volume, volume_files
 from scenes.surfaces import OTHER_ENDINGS, is_surface_file
-from scenes.terminal import Progress, silent
+from scenes.terminal import Progress, shell_command, silent
 from scenes.volumes.dicom_references import NO_REFERENCES, DicomReferences
 from scenes.volumes.lazy_volume import LazyVolume
 from scenes.volumes.volume_files import ENDINGS, file_volume, is_volume_file
@@ -153,6 +153,10 @@ def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
             f"{', '.join(ENDINGS)}; convert it"
         )
     if not items and not volume_files(path):
+        if any(is_surface_file(file) for file in path.iterdir()):
+            raise PatientError(
+                f"{path}: has surfaces, and no CT; expected a CT before them: {shell_command('import', 'CT', path, '--out', 'FOLDER')}"
+            )
         raise PatientError(
             f"{path}: no DICOM file found; give the folder of the slices, or a NIfTI, NRRD or MHA file"
         )
