@@ -132,9 +132,10 @@ class UserInput:
         """Note a step that was made."""
         self.session.note_changes("solver", dict(iterations=step.iterations))
         self.session.end_step(step.pose, step.length_s, step.wrench)
-        if step.pace != self._pace:
-            self._pace = step.pace
+        # In the terminal once, not for each length: the panel shows the present one.
+        if bool(step.pace) != bool(self._pace):
             self.notices.post(step.pace or "Steps as they are set again.", on_screen=False)
+        self._pace = step.pace
 
     def after_frame(self) -> None:
         """Let the session's file keep up."""
