@@ -185,7 +185,8 @@ class RehearsalRun:
             script = ResectionScript(list(self.files.track.actions))
         elif self.link is not None and self.asked.link_leads:
             tracked = self.link.received_pose.pose
-        return UserInput(session, recorder, begins is not None, tracked, script, self.notices)
+        begun = begins is not None
+        return UserInput(session, recorder, begun, tracked, script, self.notices, self.files.resection_plan)
 
     def _replay_input(self, replay: Replay) -> ReplayInput:
         return ReplayInput(replay, self._take_over, self.notices)

@@ -21,10 +21,11 @@ from ultrasound.scanner import plane_section
 IsSeen = Callable[[np.ndarray], np.ndarray]
 
 
-def set_marks(session: Session, marks: np.ndarray) -> None:
-    """Add marks (n, 3) at rest [mm] to the score. Raises ResectionError."""
+def set_marks(session: Session, marks: np.ndarray, replaces: bool = False) -> None:
+    """Add marks (n, 3) at rest [mm] to the score, or have them instead of those that are set. Raises ResectionError."""
     rehearsal = session.rehearsal
-    resection = rehearsal.resection.with_marks(marks)
+    before = replace(rehearsal.resection, marks=()) if replaces else rehearsal.resection
+    resection = before.with_marks(marks)
     session.note("marks", [list(mark) for mark in resection.marks])
     rehearsal.set_resection(resection)
 

@@ -107,5 +107,5 @@ class ResectionView:
             # The reason; what to do about it is said where a cut is refused.
             parts.append(self.fault.partition(";")[0])
         if len(self.tumour_mm) and self.tumour_mm.min() < settings.margin_mm - TOLERANCE_MM:
-            parts.append(f"{self.tumour_mm.min():.1f} of {settings.margin_mm:.0f} mm margin")
+            parts.append(f"red: {self.tumour_mm.min():.1f} of {settings.margin_mm:.0f} mm margin")
         return "   ".join(parts)

@@ -353,6 +353,7 @@ def test_the_view_warns_of_a_line_that_is_too_near_and_shows_the_coming_cut(rehe
     # Between marks a geodesic may be nearer than they are, by the sagitta of their arc.
     assert distance_to_tumour(rehearsal).min() > MARGIN_MM - 0.5
     assert shown.score(MARGIN_MM + 2.0).is_near.all()
+    assert "red: " in shown.status(CutSettings(margin_mm=MARGIN_MM + 2.0))
     assert f"{rehearsal.score.length_mm:.0f} mm" in shown.status(CutSettings())
     seen.seen[:] = False
     shown.update(CutSettings(), seen.is_seen, 1.0)
@@ -404,6 +405,15 @@ def test_it_is_cut_but_once_and_page_score_and_plan_are_written_and_compared(
     points = np.array([point["position"] for point in curve["controlPoints"]])
     assert curve["type"] == "ClosedCurve" and curve["coordinateSystem"] == "LPS"
     assert np.abs(signed_distance_from(anatomy.organ, points)).max() < 0.3
+    rehearsal.reset()
+    live = UserInput(Session(rehearsal), resection_plan=plan)
+    set_marks(live.session, marks[:3])
+    moved(live, score_planned=True)
+    assert np.abs(rehearsal.score.points + rehearsal.origin - np.array(plan.best.line_mm)).max() < 0.05
+    assert "for enucleoresection with a margin of 5 mm" in live.notices.present()[0]
+    live = UserInput(Session(rehearsal))
+    moved(live, score_planned=True)
+    assert "no planned line; make a plan" in live.notices.present()[0]
     whole = path.read_text()
     path.write_text(whole.replace('"margin_min_mm"', '"margin_minimum_mm"'))
     with pytest.raises(ResectionPlanError, match="margin_min_mm is no number"):
