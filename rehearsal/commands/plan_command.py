@@ -135,7 +135,7 @@ def table_of(proposals: list["Proposal"]) -> str:
         [
             each.settings.technique,
             each.cost_ml,
-            each.judgement.margin.margin_mm.min(),
+            each.judgement.margin.least_mm,
             each.judgement.parenchyma_removed_ml,
             each.judgement.collecting_system_opened_mm2,
             None if each.judgement.vessels is None else len(each.judgement.vessels),

@@ -15,6 +15,8 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.cut import Cut
 from rehearsal.resection.judgement import MARGIN_LIMITS_MM, NOT_LABELLED, Judgement
+from rehearsal.resection.operation import distance_to_tumour
+from rehearsal.resection.proposal import KEPT_WITHIN_MM
 from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.score_line import ResectionError
 from rehearsal.result_files import counted, save_figure, write_json
@@ -44,6 +46,7 @@ def report_of(rehearsal: Rehearsal, plan: ResectionPlan | None = None) -> dict[s
         depth_mm=asked.depth_mm,
         filling=asked.filling,
         tumour_seen_percent=round(100 * seen, 1),
+        score_to_tumour_mm=round(float(distance_to_tumour(rehearsal).min()), 2),
         **judgement.report(),
         **({} if plan is None else dict(against_plan=plan.compared(judgement))),
     )
@@ -148,6 +151,25 @@ def _draw_figures(figure: Figure, report: dict[str, Any]) -> float:
     return height
 
 
+def why_less(report: dict[str, Any]) -> list[tuple[str, str]]:
+    """Why the least margin is below the one that was asked for, as a row; none where it is not."""
+    asked, line = report["margin_asked_mm"], report["score_to_tumour_mm"]
+    if report["margin_min_mm"] >= asked - KEPT_WITHIN_MM:
+        return []
+    reasons = []
+    if report["depth_mm"] is not None:
+        reasons.append("the depth was set")
+    elif report["technique"] == "enucleation":
+        reasons.append("an enucleation has no margin")
+    elif report["tumour_seen_percent"] < 100:
+        reasons.append("kept only from the tumour surface seen")
+    if line < asked:
+        reasons.append(f"the score is {line:.1f} mm from the tumour")
+    if report["technique"] == "wedge":
+        reasons.append("the walls of a wedge are straight")
+    return [("less than asked", "; ".join(reasons))] if reasons else []
+
+
 def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
     """Names and values of a report, for the page and the terminal."""
     depth = "as deep as seen" if report["depth_mm"] is None else f"{report['depth_mm']:g} mm deep"
@@ -169,13 +191,14 @@ def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
     )
     return [
         ("technique", f"{report['technique']}, {depth}; {report['filling']} in the crater"),
-        ("tumour seen", f"{report['tumour_seen_percent']:.0f} % of its surface"),
+        ("tumour surface seen", f"{report['tumour_seen_percent']:.0f} %"),
         (
             "margin",
             f"{report['margin_min_mm']:.1f} mm least, {report['margin_mean_mm']:.1f} mm mean; asked {report['margin_asked_mm']:g}",
         ),
+        *why_less(report),
         (
-            "in the tissue as cut",
+            "margin, tissue as cut",
             f"{report['margin_min_as_cut_mm']:.1f} mm least, {report['margin_mean_as_cut_mm']:.1f} mm mean",
         ),
         (f"area below {limits} mm", f"{below} mm2"),

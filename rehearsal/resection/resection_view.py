@@ -18,6 +18,8 @@ from ultrasound.scanner import plane_section
 TOLERANCE_MM = 0.5
 # Period of what the images have shown: a coming cut takes longer than a frame.
 SEEN_S = 0.5
+# A cut by less of the tumour's surface is warned of: it may go through the rest.
+LEAST_SEEN = 0.8
 
 
 def cut_settings(settings: Settings) -> CutSettings:
@@ -30,7 +32,8 @@ def cut_settings(settings: Settings) -> CutSettings:
 class ResectionView:
     """The score and the coming resection surface of a rehearsal.
 
-    ``plan`` is what is to be followed, if anything. ``fault`` says why a cut is not possible now; ``tumour_mm`` (k,) are the distances of the score's points from the tumour's outline.
+    ``plan`` is what is to be followed, if anything. ``fault`` says why a cut is not possible now; ``tumour_mm`` (k,) are the distances of the score's points from the
+    tumour's outline, ``seen_share`` is the share of the tumour's surface that the images have shown.
     """
 
     def __init__(self, rehearsal: Rehearsal, plan: ResectionPlan | None = None) -> None:
@@ -41,6 +44,7 @@ class ResectionView:
             self._plan_skin = Skin(rehearsal.model, line)
         self.fault = ""
         self.tumour_mm = np.zeros(0)
+        self.seen_share = 1.0
         self._planned: Cut | None = None
         # Nodes and weights of the vertices of the coming specimen. Not a skin, of which there would be one for each change.
         self._carried_by: tuple[np.ndarray, np.ndarray] = np.zeros((0, 8), int), np.zeros((0, 8))
@@ -57,6 +61,7 @@ class ResectionView:
         if of == self._of:
             return
         seen = is_seen(points)
+        self.seen_share = float(seen.mean()) if len(seen) else 1.0
         has_news = of[:3] != self._of[:3] or seen.tobytes() != self._seen
         self._of, self._seen = of, seen.tobytes()
         if not has_news:
@@ -108,4 +113,6 @@ class ResectionView:
             parts.append(self.fault.partition(";")[0])
         if len(self.tumour_mm) and self.tumour_mm.min() < settings.margin_mm - TOLERANCE_MM:
             parts.append(f"red: {self.tumour_mm.min():.1f} of {settings.margin_mm:.0f} mm margin")
+        if settings.depth_mm is None and self.seen_share < LEAST_SEEN:
+            parts.append(f"tumour surface seen {100 * self.seen_share:.0f} %: sweep over the rest")
         return "   ".join(parts)

@@ -25,7 +25,7 @@ from rehearsal.resection.operation import (
     set_marks,
 )
 from rehearsal.resection.proposal import line_around, propose
-from rehearsal.resection.resection_page import report_of, rows_of, save_page
+from rehearsal.resection.resection_page import report_of, rows_of, save_page, why_less
 from rehearsal.resection.resection_plan import (
     ResectionPlan,
     ResectionPlanError,
@@ -355,9 +355,12 @@ def test_the_view_warns_of_a_line_that_is_too_near_and_shows_the_coming_cut(rehe
     assert shown.score(MARGIN_MM + 2.0).is_near.all()
     assert "red: " in shown.status(CutSettings(margin_mm=MARGIN_MM + 2.0))
     assert f"{rehearsal.score.length_mm:.0f} mm" in shown.status(CutSettings())
+    assert "seen" not in shown.status(CutSettings())
     seen.seen[:] = False
     shown.update(CutSettings(), seen.is_seen, 1.0)
     assert "no part of the tumour was seen" in shown.status(CutSettings())
+    assert "tumour surface seen 0 %" in shown.status(CutSettings())
+    assert "surface seen" not in shown.status(CutSettings(depth_mm=12.0))
     assert shown.section(np.eye(4)) is None
     seen.seen[:] = True
     shown.update(CutSettings(), seen.is_seen, 2.0)
@@ -401,6 +404,12 @@ def test_it_is_cut_but_once_and_page_score_and_plan_are_written_and_compared(
     page, figures = save_page(rehearsal, report, tmp_path)
     assert page.stat().st_size > 10_000 and json.loads(figures.read_text()) == report
     assert dict(rows_of(report))["positive margin"].startswith("0 mm2")
+    assert why_less(report) == []
+    less = report | dict(margin_min_mm=3.9, score_to_tumour_mm=4.8)
+    assert why_less(less) == [("less than asked", "the score is 4.8 mm from the tumour")]
+    assert (
+        "surface seen; the score" in dict(rows_of(less | dict(tumour_seen_percent=53.4)))["less than asked"]
+    )
     curve = json.loads(save_score(rehearsal, tmp_path).read_text())["markups"][0]
     points = np.array([point["position"] for point in curve["controlPoints"]])
     assert curve["type"] == "ClosedCurve" and curve["coordinateSystem"] == "LPS"
