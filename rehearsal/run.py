@@ -251,6 +251,8 @@ class RehearsalRun:
         click.echo(summary_text(summary))
         if report is not None:
             summary |= dict(resection=report)
+        elif self.files.resection_plan is not None:
+            click.echo("resection   nothing was cut: there is nothing to compare with the plan")
         guide = self.measurements.guide
         if guide is not None:
             _echo(guide.in_words(summary.get(f"seen_{guide.plan.target}")))

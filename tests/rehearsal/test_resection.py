@@ -11,6 +11,9 @@ import trimesh
 from coarse_patient import coarse_patient
 from conftest import ROOT
 
+from rehearsal.asked_files import read_files
+from rehearsal.commands.command_line import CommandError
+from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.resection import proposal
@@ -398,6 +401,9 @@ def test_it_is_cut_but_once_and_page_score_and_plan_are_written_and_compared(
     plan, path = ResectionPlan(anatomy="a", margin_mm=MARGIN_MM, cuts=cuts), tmp_path / "plan.json"
     write_resection_plan(plan, path)
     assert is_resection_plan(path) and read_resection_plan(path) == plan
+    with pytest.raises(CommandError, match="the scripted press cuts nothing; open it in a window, or add"):
+        read_files(RehearseOptions(headless=True, plan=path))
+    assert read_files(RehearseOptions(plan=path)).resection_plan == plan
     report = report_of(rehearsal, plan)
     # The rehearsed line is the planned one.
     assert report["against_plan"]["parenchyma_removed_ml_more"] == pytest.approx(0.0, abs=0.05)
