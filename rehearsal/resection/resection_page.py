@@ -20,6 +20,7 @@ from rehearsal.resection.proposal import KEPT_WITHIN_MM
 from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.score_line import ResectionError
 from rehearsal.result_files import counted, save_figure, write_json
+from render.background_image import ends_of
 from scenes.surfaces import signed_distance_from
 
 NAME = "resection"
@@ -27,7 +28,11 @@ NAME = "resection"
 COLOURS = ("#7a0016", "#e5383b", "#ef8a00", "#ffd60a", "#52b483")
 CAPSULE = "#d1caca"
 # Views of the specimen along the axes of the score's frame: title, direction from which it is seen, and what is up.
-VIEWS = (("resection surface, from below", (0, 0, -1), (0, 1, 0)), ("from the side", (0, -1, 0), (0, 0, 1)))
+VIEWS = (
+    ("specimen from below: resection surface", (0, 0, -1), (0, 1, 0)),
+    ("specimen from the side", (0, -1, 0), (0, 0, 1)),
+)
+NEAR_END, FAR_END = "#222222", "#a6a6a6"
 TEXT_WIDTH = 40
 LIGHT = np.array([0.4, 0.6, 0.7])
 
@@ -64,7 +69,9 @@ def save_page(rehearsal: Rehearsal, report: dict[str, Any], out: Path) -> list[P
     colours = _colours(distance, cut)
     for place, (title, eye, up) in enumerate(VIEWS):
         axes = figure.add_axes((0.01 + 0.3 * place, 0.14, 0.3, 0.76), projection="3d")
-        _draw_specimen(axes, faces @ _axes(cut, eye, up).T, colours, title)
+        seen = _axes(cut, eye, up)
+        _draw_specimen(axes, faces @ seen.T, colours, title)
+        _draw_compass(figure.add_axes((0.02 + 0.3 * place, 0.12, 0.07, 0.158)), seen)
     lowest = _draw_figures(figure, report)
     _draw_histogram(figure.add_axes((0.67, 0.12, 0.31, min(0.28, lowest - 0.15))), judgement)
     _draw_legend(figure)
@@ -108,6 +115,18 @@ def _draw_specimen(axes: Any, faces: np.ndarray, colours: np.ndarray, title: str
     axes.set_title(title, fontsize=12)
 
 
+def _draw_compass(axes: Axes, seen: np.ndarray) -> None:
+    """Draw the patient's axes by their letters, for a view's axes right, up, towards the eye (3, 3); ends towards the eye are dark."""
+    ends = ends_of(seen * [[1], [1], [-1]])
+    for place, (letter, end) in enumerate(ends):
+        colour = NEAR_END if place >= len(ends) / 2 else FAR_END
+        axes.plot([0, end[0]], [0, end[1]], color=colour, linewidth=1.2)
+        beyond = end * (1 + 0.35 / np.linalg.norm(end))
+        axes.text(beyond[0], beyond[1], letter, fontsize=10, color=colour, ha="center", va="center")
+    axes.set(xlim=(-1.4, 1.4), ylim=(-1.4, 1.4), aspect="equal")
+    axes.set_axis_off()
+
+
 def _draw_histogram(axes: Axes, judgement: Judgement) -> None:
     """Draw the area of the resection surface by its margin."""
     margin, area = judgement.margin.distance_mm, judgement.margin.area_mm2
@@ -141,7 +160,7 @@ def _draw_legend(figure: Figure) -> None:
 def _draw_figures(figure: Figure, report: dict[str, Any]) -> float:
     """Write the figures, and return the height below the last one, as a share of the page."""
     rows = rows_of(report)
-    figure.text(0.03, 0.93, "Resection", fontsize=17, weight="bold")
+    figure.text(0.03, 0.93, "Resection: the specimen, coloured by its margin", fontsize=17, weight="bold")
     height = 0.93
     for name, value in rows:
         figure.text(0.62, height, name, fontsize=10.5, color="#555555", va="top")
