@@ -7,12 +7,13 @@ from typing import Any
 
 import igl
 import numpy as np
+import trimesh
 from scipy.spatial import ConvexHull
 
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.resection_state import CutRequest, Resection
-from rehearsal.resection.score_line import ResectionError, places_on
+from rehearsal.resection.score_line import ResectionError, ScoreLine, places_on
 from rehearsal.sessions.session import Session
 from sim.fields import array_of
 from ultrasound.scanner import plane_section
@@ -120,11 +121,10 @@ def _surface_now(rehearsal: Rehearsal) -> tuple[np.ndarray, np.ndarray]:
     return array_of(rehearsal.organ_skin.vertices).astype(float), np.asarray(rehearsal.organ.faces, np.int64)
 
 
-def distance_to_tumour(rehearsal: Rehearsal) -> np.ndarray:
-    """Distance (k,) [mm] of each point of the score at rest from the outline of the tumour, both seen along the score's direction; negative over
-    the tumour. Empty without a score or a tumour.
+def distance_to_tumour(line: ScoreLine | None, tumour: trimesh.Trimesh | None) -> np.ndarray:
+    """Distance (k,) [mm] of each point of a score at rest from the outline of a tumour, both seen along the score's direction; negative over the
+    tumour. Empty without a score or a tumour.
     """
-    line, tumour = rehearsal.score, rehearsal.whole_tumour
     if line is None or tumour is None:
         return np.zeros(0)
     axes = line.frame()[:2]

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
@@ -24,6 +25,7 @@ from render.background_image import ends_of
 from scenes.surfaces import signed_distance_from
 
 NAME = "resection"
+NOTHING_CUT = "nothing was cut, or there is no tumour to judge by"
 # Colours of the margin: in the tumour, then up to each limit, then beyond the last.
 COLOURS = ("#7a0016", "#e5383b", "#ef8a00", "#ffd60a", "#52b483")
 CAPSULE = "#d1caca"
@@ -37,48 +39,62 @@ TEXT_WIDTH = 40
 LIGHT = np.array([0.4, 0.6, 0.7])
 
 
-def report_of(rehearsal: Rehearsal, plan: ResectionPlan | None = None) -> dict[str, Any]:
-    """The figures of a cut, how it was made, and its comparison with a plan, for ``report.json``. Raises ResectionError without a cut."""
-    judgement, request = rehearsal.judgement, rehearsal.resection.cut
-    if judgement is None or request is None:
-        raise ResectionError("nothing was cut, or there is no tumour to judge by")
-    asked = request.settings
-    tumour = rehearsal.whole_tumour
-    seen = 0.0 if tumour is None else float(request.seen_of(len(tumour.vertices)).mean())
+def figures_of(
+    cut: Cut, judgement: Judgement, tumour: trimesh.Trimesh, seen_percent: float | None = None
+) -> dict[str, Any]:
+    """The figures of a cut, and how it was made; ``seen_percent`` of the tumour's surface was seen, None where no image was."""
+    asked = cut.settings
     return dict(
         technique=asked.technique,
         margin_asked_mm=asked.margin_mm,
         depth_mm=asked.depth_mm,
         filling=asked.filling,
-        tumour_seen_percent=round(100 * seen, 1),
-        score_to_tumour_mm=round(float(distance_to_tumour(rehearsal).min()), 2),
+        tumour_seen_percent=seen_percent,
+        score_to_tumour_mm=round(float(distance_to_tumour(cut.line, tumour).min()), 2),
         **judgement.report(),
-        **({} if plan is None else dict(against_plan=plan.compared(judgement))),
     )
+
+
+def report_of(rehearsal: Rehearsal, plan: ResectionPlan | None = None) -> dict[str, Any]:
+    """The figures of a cut, how it was made, and its comparison with a plan, for ``report.json``. Raises ResectionError without a cut."""
+    cut, judgement, request = rehearsal.cut, rehearsal.judgement, rehearsal.resection.cut
+    tumour = rehearsal.whole_tumour
+    if cut is None or judgement is None or request is None or tumour is None:
+        raise ResectionError(NOTHING_CUT)
+    seen_percent = round(100 * float(request.seen_of(len(tumour.vertices)).mean()), 1)
+    compared = {} if plan is None else dict(against_plan=plan.compared(judgement))
+    return figures_of(cut, judgement, tumour, seen_percent) | compared
 
 
 def save_page(rehearsal: Rehearsal, report: dict[str, Any], out: Path) -> list[Path]:
     """Write ``resection.png`` and ``resection.json`` with a report into a folder; return them. Raises ResectionError, OSError."""
-    cut, judgement = rehearsal.cut, rehearsal.judgement
-    if cut is None or judgement is None or rehearsal.whole_tumour is None:
-        raise ResectionError("nothing was cut, or there is no tumour to judge by")
+    cut, judgement, tumour = rehearsal.cut, rehearsal.judgement, rehearsal.whole_tumour
+    if cut is None or judgement is None or tumour is None:
+        raise ResectionError(NOTHING_CUT)
+    page, figures = out / f"{NAME}.png", out / f"{NAME}.json"
+    draw_page(cut, judgement, tumour, report, page, "Resection")
+    write_json(report, figures)
+    return [page, figures]
+
+
+def draw_page(
+    cut: Cut, judgement: Judgement, tumour: trimesh.Trimesh, report: dict[str, Any], path: Path, title: str
+) -> None:
+    """Draw the page of a cut with its report as PNG. Raises OSError."""
     figure = Figure(figsize=(13.5, 6.0), facecolor="white")
     FigureCanvasAgg(figure)
+    figure.text(0.03, 0.93, f"{title}: the specimen, coloured by its margin", fontsize=17, weight="bold")
     faces = np.asarray(cut.specimen.vertices)[np.asarray(cut.specimen.faces)]
-    distance = signed_distance_from(rehearsal.whole_tumour, faces.mean(axis=1))
-    colours = _colours(distance, cut)
-    for place, (title, eye, up) in enumerate(VIEWS):
+    colours = _colours(signed_distance_from(tumour, faces.mean(axis=1)), cut)
+    for place, (name, eye, up) in enumerate(VIEWS):
         axes = figure.add_axes((0.01 + 0.3 * place, 0.14, 0.3, 0.76), projection="3d")
         seen = _axes(cut, eye, up)
-        _draw_specimen(axes, faces @ seen.T, colours, title)
+        _draw_specimen(axes, faces @ seen.T, colours, name)
         _draw_compass(figure.add_axes((0.02 + 0.3 * place, 0.12, 0.07, 0.158)), seen)
     lowest = _draw_figures(figure, report)
     _draw_histogram(figure.add_axes((0.67, 0.12, 0.31, min(0.28, lowest - 0.15))), judgement)
     _draw_legend(figure)
-    page, figures = out / f"{NAME}.png", out / f"{NAME}.json"
-    save_figure(figure, page, dpi=110)
-    write_json(report, figures)
-    return [page, figures]
+    save_figure(figure, path, dpi=110)
 
 
 def _axes(cut: Cut, eye: tuple[int, int, int], up: tuple[int, int, int]) -> np.ndarray:
@@ -160,7 +176,6 @@ def _draw_legend(figure: Figure) -> None:
 def _draw_figures(figure: Figure, report: dict[str, Any]) -> float:
     """Write the figures, and return the height below the last one, as a share of the page."""
     rows = rows_of(report)
-    figure.text(0.03, 0.93, "Resection: the specimen, coloured by its margin", fontsize=17, weight="bold")
     height = 0.93
     for name, value in rows:
         figure.text(0.62, height, name, fontsize=10.5, color="#555555", va="top")
@@ -172,7 +187,9 @@ def _draw_figures(figure: Figure, report: dict[str, Any]) -> float:
 
 def why_less(report: dict[str, Any]) -> list[tuple[str, str]]:
     """Why the least margin is below the one that was asked for, as a row; none where it is not."""
-    asked, line = report["margin_asked_mm"], report["score_to_tumour_mm"]
+    asked, line, seen = (
+        report[name] for name in ("margin_asked_mm", "score_to_tumour_mm", "tumour_seen_percent")
+    )
     if report["margin_min_mm"] >= asked - KEPT_WITHIN_MM:
         return []
     reasons = []
@@ -180,7 +197,7 @@ def why_less(report: dict[str, Any]) -> list[tuple[str, str]]:
         reasons.append("the depth was set")
     elif report["technique"] == "enucleation":
         reasons.append("an enucleation has no margin")
-    elif report["tumour_seen_percent"] < 100:
+    elif seen is not None and seen < 100:
         reasons.append("kept only from the tumour surface seen")
     if line < asked:
         reasons.append(f"the score is {line:.1f} mm from the tumour")
@@ -191,7 +208,8 @@ def why_less(report: dict[str, Any]) -> list[tuple[str, str]]:
 
 def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
     """Names and values of a report, for the page and the terminal."""
-    depth = "as deep as seen" if report["depth_mm"] is None else f"{report['depth_mm']:g} mm deep"
+    depth = "to the tumour's depth" if report["depth_mm"] is None else f"{report['depth_mm']:g} mm deep"
+    seen = report["tumour_seen_percent"]
     opened, divided = report["collecting_system_opened_mm2"], report["vessels"]
     vessels = [f"{each['tissue']} {each['diameter_mm']:.1f} mm" for each in divided or []]
     shown = ", ".join(vessels[:3]) + (f" and {len(vessels) - 3} more" if len(vessels) > 3 else "")
@@ -210,7 +228,7 @@ def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
     )
     return [
         ("technique", f"{report['technique']}, {depth}; {report['filling']} in the crater"),
-        ("tumour surface seen", f"{report['tumour_seen_percent']:.0f} %"),
+        *([] if seen is None else [("tumour surface seen", f"{seen:.0f} %")]),
         (
             "margin",
             f"{report['margin_min_mm']:.1f} mm least, {report['margin_mean_mm']:.1f} mm mean; asked {report['margin_asked_mm']:g}",

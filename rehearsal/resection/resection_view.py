@@ -67,7 +67,7 @@ class ResectionView:
         if not has_news:
             return
         self.fault, self._planned = self.rehearsal.score_fault, None
-        self.tumour_mm = distance_to_tumour(self.rehearsal)
+        self.tumour_mm = distance_to_tumour(self.rehearsal.score, tumour)
         line, model = self.rehearsal.score, self.rehearsal.model
         if line is None or resection.cut is not None or not isinstance(model, NeoHookean):
             return

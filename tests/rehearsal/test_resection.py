@@ -27,8 +27,8 @@ from rehearsal.resection.operation import (
     places_at_rest,
     set_marks,
 )
-from rehearsal.resection.proposal import line_around, propose
-from rehearsal.resection.resection_page import report_of, rows_of, save_page, why_less
+from rehearsal.resection.proposal import line_around, propose, why_first
+from rehearsal.resection.resection_page import draw_page, figures_of, report_of, rows_of, save_page, why_less
 from rehearsal.resection.resection_plan import (
     ResectionPlan,
     ResectionPlanError,
@@ -338,9 +338,9 @@ def test_the_distance_of_a_line_to_the_tumour_is_negative_over_it():
         frame=lambda: np.eye(3), points=np.array([[0.0, 0, 9], [5, 0, 9], [8, 0, 9], [8, 9, 9]])
     )
     tumour = trimesh.creation.box([10.0, 10.0, 10.0])
-    found = distance_to_tumour(SimpleNamespace(score=line, whole_tumour=tumour))
+    found = distance_to_tumour(line, tumour)
     assert found == pytest.approx([-5.0, 0.0, 3.0, 5.0], abs=1e-12)
-    assert len(distance_to_tumour(SimpleNamespace(score=line, whole_tumour=None))) == 0
+    assert len(distance_to_tumour(line, None)) == 0
 
 
 def test_the_view_warns_of_a_line_that_is_too_near_and_shows_the_coming_cut(rehearsal, marks):
@@ -354,7 +354,7 @@ def test_the_view_warns_of_a_line_that_is_too_near_and_shows_the_coming_cut(rehe
     score = shown.score(MARGIN_MM)
     assert not score.is_near.any() and "margin" not in shown.status(CutSettings())
     # Between marks a geodesic may be nearer than they are, by the sagitta of their arc.
-    assert distance_to_tumour(rehearsal).min() > MARGIN_MM - 0.5
+    assert distance_to_tumour(rehearsal.score, rehearsal.whole_tumour).min() > MARGIN_MM - 0.5
     assert shown.score(MARGIN_MM + 2.0).is_near.all()
     assert "red: " in shown.status(CutSettings(margin_mm=MARGIN_MM + 2.0))
     assert f"{rehearsal.score.length_mm:.0f} mm" in shown.status(CutSettings())
@@ -397,6 +397,19 @@ def test_it_is_cut_but_once_and_page_score_and_plan_are_written_and_compared(
     costs = [each.cost_ml for each in proposals]
     assert len(costs) > 1 and costs == sorted(costs) and proposals[0].settings.technique == "enucleoresection"
     assert proposals[0].judgement.margin.margin_mm.min() > MARGIN_MM - 0.1
+    why = why_first(proposals)
+    assert why.startswith(
+        f"The first, enucleoresection, costs {costs[1] - costs[0]:.1f} points less than the next: "
+    )
+    assert why_first(proposals[:1]) == "" and "None" not in why
+    best = proposals[0]
+    figures = figures_of(best.cut, best.judgement, anatomy.tumour)
+    assert (
+        "tumour surface seen" not in dict(rows_of(figures))
+        and figures["score_to_tumour_mm"] > MARGIN_MM - 0.5
+    )
+    draw_page(best.cut, best.judgement, anatomy.tumour, figures, tmp_path / "plan.png", "Planned resection")
+    assert (tmp_path / "plan.png").stat().st_size > 10_000
     cuts = [planned_cut(each, np.zeros(3)) for each in proposals]
     plan, path = ResectionPlan(anatomy="a", margin_mm=MARGIN_MM, cuts=cuts), tmp_path / "plan.json"
     write_resection_plan(plan, path)
