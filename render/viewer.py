@@ -142,6 +142,8 @@ class Geometry:
     """It does not move."""
     specimen: Surface | None = None
     """What was cut out, beside the organ. It does not move."""
+    bed: Surface | None = None
+    """The faces of the organ that a cut has made."""
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from rehearsal.commands.command_line import CommandError
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.measurements.live_measurements import LiveMeasurements
+from rehearsal.open_window import geometry_of
 from rehearsal.resection import proposal
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.judgement import findings_of
@@ -132,8 +133,11 @@ def test_a_cut_keeps_the_margin_and_undo_brings_all_back_bit_for_bit(rehearsal, 
     assert np.isfinite(array_of(rehearsal.body.position)).all()
     assert rehearsal.volume_ratio() == pytest.approx(1.0, abs=0.01)
     assert findings_of(judged)["specimen"].endswith("ml")
+    assert len(geometry_of(rehearsal).bed[1]) == cut.on_remnant.sum() > 100
     moved(live, undo=True)
-    assert rehearsal.cut is None and len(rehearsal.resection.marks) == len(marks)
+    assert rehearsal.cut is geometry_of(rehearsal).bed is None and len(rehearsal.resection.marks) == len(
+        marks
+    )
     moved(live, undo=True)
     assert rehearsal.resection == NO_RESECTION and rehearsal.cut is rehearsal.judgement is None
     assert rehearsal.digest() == before and rehearsal.organ is rehearsal.whole_organ

@@ -513,6 +513,18 @@ def test_other_geometry_has_its_own_sliders(window):
     assert np.any(before != after, axis=2)[opened.layout.strip.slices].any()
 
 
+@pytest.mark.parametrize("translucent", [False, True])
+def test_the_bed_of_a_cut_is_solid_in_a_translucent_organ(window, translucent):
+    opened, field, _ = window
+    faces = opened._geometry.organ[1]
+    opened.settings.translucent = translucent
+    opened.draw(_far_view())
+    before = opened.picture().astype(int)
+    opened.change_geometry(dataclasses.replace(opened._geometry, bed=(field, faces[: len(faces) // 2])))
+    brighter = (opened.picture() - before).max(axis=2) > 20
+    assert brighter[opened.layout.clear.slices].any() == translucent
+
+
 @pytest.mark.parametrize(("setting", "value"), [("translucent", True), ("cut", True), ("level_hu", 90)])
 def test_settings_are_seen(window, setting, value):
     opened, _, _ = window
