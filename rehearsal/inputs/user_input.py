@@ -12,7 +12,15 @@ from rehearsal.notices import Notices
 from rehearsal.pressed_organ import Step
 from rehearsal.real_time.solver_process import SolverProcess
 from rehearsal.resection.cut import CutSettings
-from rehearsal.resection.operation import cut, mark_under, marks_of_image, places_at_rest, set_marks
+from rehearsal.resection.operation import (
+    LEAST_SEEN,
+    cut,
+    mark_under,
+    marks_of_image,
+    places_at_rest,
+    seen_share,
+    set_marks,
+)
 from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.resection_view import cut_settings
 from rehearsal.resection.score_line import ResectionError
@@ -31,6 +39,7 @@ AFTER_ACTION = (
     *("reset", "undo", "redo", "bookmark", "to_bookmark"),
     *("score_image", "score_under", "score_planned", "cut_out"),
 )
+UNSEEN = "tumour surface seen {:.0f} %: the cut keeps no margin from the rest"
 NOTHING = {each.name: each.default for each in fields(Controls) if each.name in AFTER_ACTION}
 
 
@@ -211,7 +220,9 @@ class UserInput:
         coverage = self.session.coverage if self.session.rehearsal.scanner is not None else None
         cut(self.session, settings, None if coverage is None else coverage().is_seen)
         made, judgement = self.session.rehearsal.cut, self.session.rehearsal.judgement
+        seen, is_as_deep = seen_share(self.session.rehearsal), settings.depth_mm is None
         warnings = [
+            *([UNSEEN.format(100 * seen)] if is_as_deep and seen < LEAST_SEEN else []),
             *(made.warnings if made is not None else ()),
             *(judgement.warnings() if judgement is not None else ()),
         ]

@@ -20,6 +20,8 @@ from ultrasound.scanner import plane_section
 
 # Which of points at rest (n, 3) [mm] the images have shown so far.
 IsSeen = Callable[[np.ndarray], np.ndarray]
+# A cut by less of the tumour's surface is warned of: it may go through the rest.
+LEAST_SEEN = 0.8
 
 
 def set_marks(session: Session, marks: np.ndarray, replaces: bool = False) -> None:
@@ -44,6 +46,14 @@ def cut(session: Session, settings: CutSettings, is_seen: IsSeen | None) -> None
     request = CutRequest.of(settings, seen, rehearsal.body.snapshot().position)
     rehearsal.set_resection(replace(rehearsal.resection, cut=request))
     session.note("cut", asdict(settings) | dict(seen=base64.b64encode(request.seen).decode("ascii")))
+
+
+def seen_share(rehearsal: Rehearsal) -> float:
+    """The share of the tumour's surface that the images had shown when it was cut; 1 without a cut or a tumour."""
+    request, tumour = rehearsal.resection.cut, rehearsal.whole_tumour
+    if request is None or tumour is None:
+        return 1.0
+    return float(request.seen_of(len(tumour.vertices)).mean())
 
 
 def repeat_cut(rehearsal: Rehearsal, recorded: dict[str, Any]) -> None:

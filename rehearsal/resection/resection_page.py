@@ -16,7 +16,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.cut import Cut
 from rehearsal.resection.judgement import MARGIN_LIMITS_MM, NOT_LABELLED, Judgement
-from rehearsal.resection.operation import distance_to_tumour
+from rehearsal.resection.operation import distance_to_tumour, seen_share
 from rehearsal.resection.proposal import KEPT_WITHIN_MM
 from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.score_line import ResectionError
@@ -57,11 +57,10 @@ def figures_of(
 
 def report_of(rehearsal: Rehearsal, plan: ResectionPlan | None = None) -> dict[str, Any]:
     """The figures of a cut, how it was made, and its comparison with a plan, for ``report.json``. Raises ResectionError without a cut."""
-    cut, judgement, request = rehearsal.cut, rehearsal.judgement, rehearsal.resection.cut
-    tumour = rehearsal.whole_tumour
-    if cut is None or judgement is None or request is None or tumour is None:
+    cut, judgement, tumour = rehearsal.cut, rehearsal.judgement, rehearsal.whole_tumour
+    if cut is None or judgement is None or tumour is None:
         raise ResectionError(NOTHING_CUT)
-    seen_percent = round(100 * float(request.seen_of(len(tumour.vertices)).mean()), 1)
+    seen_percent = round(100 * seen_share(rehearsal), 1)
     compared = {} if plan is None else dict(against_plan=plan.compared(judgement))
     return figures_of(cut, judgement, tumour, seen_percent) | compared
 

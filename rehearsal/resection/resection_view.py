@@ -4,7 +4,7 @@ import numpy as np
 
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.cut import Cut, CutSettings, cut_organ
-from rehearsal.resection.operation import IsSeen, distance_to_tumour
+from rehearsal.resection.operation import LEAST_SEEN, IsSeen, distance_to_tumour
 from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.score_line import ResectionError
 from render.viewer import Score, Settings
@@ -18,8 +18,6 @@ from ultrasound.scanner import plane_section
 TOLERANCE_MM = 0.5
 # Period of what the images have shown: a coming cut takes longer than a frame.
 SEEN_S = 0.5
-# A cut by less of the tumour's surface is warned of: it may go through the rest.
-LEAST_SEEN = 0.8
 
 
 def cut_settings(settings: Settings) -> CutSettings:
@@ -104,15 +102,15 @@ class ResectionView:
         if count == 0 or self.rehearsal.cut is not None:
             return ""
         line = self.rehearsal.score
-        parts = [
-            f"SCORE {count} marks" + ("" if line is None else f" {line.length_mm:.0f} mm"),
-            settings.technique,
-        ]
+        # The rest of what is too long for the panel is not shown.
+        parts = [f"SCORE {count} marks"]
         if self.fault:
             # The reason; what to do about it is said where a cut is refused.
             parts.append(self.fault.partition(";")[0])
+        if settings.depth_mm is None and self.seen_share < LEAST_SEEN:
+            parts.append(f"tumour surface seen {100 * self.seen_share:.0f} %")
         if len(self.tumour_mm) and self.tumour_mm.min() < settings.margin_mm - TOLERANCE_MM:
             parts.append(f"red: {self.tumour_mm.min():.1f} of {settings.margin_mm:.0f} mm margin")
-        if settings.depth_mm is None and self.seen_share < LEAST_SEEN:
-            parts.append(f"tumour surface seen {100 * self.seen_share:.0f} %: sweep over the rest")
+        parts += [] if line is None else [f"{line.length_mm:.0f} mm"]
+        parts.append(settings.technique)
         return "   ".join(parts)

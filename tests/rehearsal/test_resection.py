@@ -233,6 +233,10 @@ def test_what_cannot_be_done_is_refused_in_words(rehearsal, marks):
     )
     moved(live, 2)
     assert "no part of the tumour was seen" in live.notices.present(lambda words: words)[0]
+    every_other = SimpleNamespace(is_seen=lambda points: np.arange(len(points)) % 2 == 0)
+    live = acting(rehearsal, ScriptedAction(0.0, cut=CutSettings()), coverage=lambda: every_other)
+    moved(live)
+    assert rehearsal.cut is not None and "tumour surface seen 50 %" in live.notices.present()[0]
 
 
 def test_a_cut_through_the_hilum_is_refused(rehearsal):
