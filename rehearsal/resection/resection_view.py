@@ -102,8 +102,8 @@ class ResectionView:
         if count == 0 or self.rehearsal.cut is not None:
             return ""
         line = self.rehearsal.score
-        # The rest of what is too long for the panel is not shown.
-        parts = [f"SCORE {count} marks"]
+        # Warnings first: of what is too long for the panel, the last is not shown.
+        parts = []
         if self.fault:
             # The reason; what to do about it is said where a cut is refused.
             parts.append(self.fault.partition(";")[0])
@@ -111,6 +111,6 @@ class ResectionView:
             parts.append(f"tumour surface seen {100 * self.seen_share:.0f} %")
         if len(self.tumour_mm) and self.tumour_mm.min() < settings.margin_mm - TOLERANCE_MM:
             parts.append(f"red: {self.tumour_mm.min():.1f} of {settings.margin_mm:.0f} mm margin")
-        parts += [] if line is None else [f"{line.length_mm:.0f} mm"]
+        parts.append(f"SCORE {count} marks" + ("" if line is None else f" {line.length_mm:.0f} mm"))
         parts.append(settings.technique)
         return "   ".join(parts)
