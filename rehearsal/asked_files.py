@@ -61,6 +61,11 @@ def read_files(asked: RehearseOptions) -> AskedFiles:
     plan = resection_plan = None
     if asked.plan is not None and is_resection_plan(asked.plan):
         resection_plan = read_resection_plan(asked.plan)
+        if asked.headless and not (asked.track or asked.replay):
+            raise CommandError(
+                f"--plan: {asked.plan} is a plan of a resection, and the scripted press cuts nothing; open it in a window, or add poses "
+                "with a cut (--track) or a session (--replay), which is then compared with it"
+            )
     elif asked.plan is not None:
         plan = read_plan(asked.plan)
     log = session_of(asked.replay, asked.at) if asked.replay else None

@@ -229,8 +229,7 @@ class WindowFrames(Frames[WindowInput]):
     def drive(self, controls: Controls) -> None:
         """Apply the keys of freeze, cine and plans; then tell the solver what to do, unless frozen."""
         restores = (controls.reset, controls.undo, controls.redo, controls.bookmark, controls.to_bookmark)
-        operates = (controls.score_image, controls.score_under is not None, controls.cut_out)
-        ends_freeze = (*restores, *operates)
+        ends_freeze = (*restores, controls.operates)
         if any(ends_freeze):
             # They change the state, whose image counts for the coverage.
             self._observe_last()

@@ -22,6 +22,7 @@ from scenes.atomic_files import atomic_write
 
 # An animation is held in memory: a long session has fewer images in it.
 MOST_SHOWN = 240
+ANIMATION = "press.webp"
 
 
 class Pictures:
@@ -61,9 +62,9 @@ class Pictures:
 
     def save(self) -> str:
         """Write the animation; return what was written."""
-        with atomic_write(self.out / "press.webp") as partial:
+        with atomic_write(self.out / ANIMATION) as partial:
             save_animation(self._animation, partial)
-        return f"{-(-self.steps // self._every)} pictures, press.webp"
+        return f"{-(-self.steps // self._every)} pictures, {ANIMATION}"
 
 
 def run_headless(
@@ -108,3 +109,5 @@ def run_headless(
     write_json(report, out / "report.json")
     click.echo(summary(report))
     click.echo(f"Wrote {' and '.join([*drawn, 'report.json'])} to {out}")
+    if drawn:
+        click.echo(f"Open first: {out / ANIMATION}, a film of the run (a web browser shows it)")

@@ -82,8 +82,12 @@ def geometry_of(rehearsal: Rehearsal) -> Geometry:
     if rehearsal.supports:
         fixed = rehearsal.supports[0]
         support = np.asarray(fixed.vertices, np.float32), np.asarray(fixed.faces, np.int32)
-    specimen = None
+    specimen = bed = None
     if rehearsal.cut is not None:
+        bed = (
+            rehearsal.organ_skin.vertices,
+            np.asarray(rehearsal.organ.faces, np.int32)[rehearsal.cut.on_remnant],
+        )
         specimen = (
             rehearsal.specimen_beside().astype(np.float32),
             np.asarray(rehearsal.cut.specimen.faces, np.int32),
@@ -102,4 +106,5 @@ def geometry_of(rehearsal: Rehearsal) -> Geometry:
         },
         support=support,
         specimen=specimen,
+        bed=bed,
     )

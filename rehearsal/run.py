@@ -186,7 +186,8 @@ class RehearsalRun:
             script = ResectionScript(list(self.files.track.actions))
         elif self.link is not None and self.asked.link_leads:
             tracked = self.link.received_pose.pose
-        return UserInput(session, recorder, begins is not None, tracked, script, self.notices)
+        begun = begins is not None
+        return UserInput(session, recorder, begun, tracked, script, self.notices, self.files.resection_plan)
 
     def _replay_input(self, replay: Replay) -> ReplayInput:
         return ReplayInput(replay, self._take_over, self.notices)
@@ -251,6 +252,8 @@ class RehearsalRun:
         click.echo(summary_text(summary))
         if report is not None:
             summary |= dict(resection=report)
+        elif self.files.resection_plan is not None:
+            click.echo("resection   nothing was cut: there is nothing to compare with the plan")
         guide = self.measurements.guide
         if guide is not None:
             _echo(guide.in_words(summary.get(f"seen_{guide.plan.target}")))

@@ -58,6 +58,7 @@ KEY_MAP = {
     "Resection": {
         "score: a mark on the organ": {"score_under": "Shift+Left button"},
         "score: marks beside the tumour's edges in the image": {"score_image": "Shift+M"},
+        "score: the marks of the planned line, instead of any others": {"score_planned": "Shift+L"},
         "technique: enucleoresection, wedge, enucleation": {"technique": "Shift+T"},
         "depth of the cut; air or fluid in the crater": {"show_resection": "Shift+G"},
         "cut along the score": {"cut_out": "Shift+X"},

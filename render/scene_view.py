@@ -27,7 +27,7 @@ MAX_SEGMENTS = 2000
 TO_GO, DONE = np.array([1.0, 0.93, 0.17], np.float32), np.array([0.30, 0.75, 0.42], np.float32)
 GOAL = (1.0, 0.86, 0.45)
 PLAN_WIDTH, GOAL_WIDTH = 2.6, 1.8
-SPECIMEN = (0.72, 0.45, 0.38)
+SPECIMEN, BED = (0.72, 0.45, 0.38), (0.86, 0.56, 0.47)
 # The score: a line over the capsule, red where it is too near to the tumour, and its marks as small crosses.
 SCORED, NEAR = np.array([0.61, 0.77, 1.0], np.float32), np.array([0.98, 0.23, 0.18], np.float32)
 MAX_SCORE, MAX_MARKS, MARK_MM, SCORE_LIFT_MM, SCORE_WIDTH = 600, 200, 1.2, 0.6, 3.0
@@ -47,6 +47,7 @@ class SceneView:
         if geometry.specimen is not None:
             vertices, faces = geometry.specimen
             self._specimen = ShadedSurface(field_of(vertices, within=1), faces, SPECIMEN)
+        self._bed = None if geometry.bed is None else ShadedSurface(*geometry.bed, BED)
         if geometry.support is not None:
             self._support = self._matt_support(*geometry.support)
         self._half_axis_mm = geometry.transducer_size_mm[2] / 2
@@ -109,6 +110,10 @@ class SceneView:
         if view.score is not None:
             self.score_lines = self.score_lines or ScoreLines()
             self.score_lines.draw(scene, view.score, toward=-ahead)
+        if self._bed is not None and settings.translucent and cut is None:
+            # A crater in a translucent surface is not seen.
+            self._bed.shade(eye, key)
+            self._bed.draw(scene)
         opacity = GLASS if settings.translucent else SOLID
         self._organ.tint(view.seen.get("organ"))
         self._organ.shade(eye, key, opacity, cut)

@@ -142,6 +142,8 @@ class Geometry:
     """It does not move."""
     specimen: Surface | None = None
     """What was cut out, beside the organ. It does not move."""
+    bed: Surface | None = None
+    """The faces of the organ that a cut has made."""
 
 
 @dataclass(frozen=True)
@@ -274,6 +276,8 @@ class Controls:
     """Set marks of the score at both edges of tumour and margin in the image."""
     score_under: tuple[np.ndarray, np.ndarray] | None = None
     """Set a mark of the score where this ray meets the organ: origin [mm] and unit direction, each (3,)."""
+    score_planned: bool = False
+    """Replace the marks of the score by those of the planned line."""
     cut_out: bool = False
     """Cut along the score."""
     acknowledge: bool = False
@@ -287,3 +291,8 @@ class Controls:
     quit: bool = False
     message: str = ""
     """Message of an input device, such as that it was unplugged."""
+
+    @property
+    def operates(self) -> bool:
+        """Whether a mark of the score is set, or a cut made."""
+        return self.score_image or self.score_under is not None or self.score_planned or self.cut_out

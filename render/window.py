@@ -98,7 +98,7 @@ class Window:
         self._warm_up = 2
         self._drag: str | None = None
         self._cursor: np.ndarray | None = None
-        self._pressing = False
+        self._pressing = self._held_shift = False
         # The boxes of sliders by group, and how often the user moved each.
         self._slider_boxes: dict[str, Rect] = {}
         self._boxes_moved: Counter[str] = Counter()
@@ -205,8 +205,11 @@ class Window:
         return cursor[0] * self.layout.width, (1 - cursor[1]) * self.layout.height
 
     def _read_events(self, controls: Controls) -> None:
+        # In a slow frame shift may be released before the frame reads its keys: it counts if it was held before, or pressed before the key.
+        with_shift, self._held_shift = self._held_shift, self._window.is_pressed(ti.ui.SHIFT)
         for event in self._window.get_events(ti.ui.PRESS):
-            self._key_down(event.key, controls)
+            with_shift = with_shift or event.key == ti.ui.SHIFT
+            self._key_down(event.key, with_shift, controls)
         for event in self._window.get_events(ti.ui.RELEASE):
             # GGUI tells presses and releases of a slow frame apart, but not their order: what is held now was pressed last.
             if self._window.is_pressed(event.key):
@@ -217,8 +220,7 @@ class Window:
             elif event.key in (ti.ui.RMB, ti.ui.MMB):
                 self._drag = None
 
-    def _key_down(self, key: str, controls: Controls) -> None:
-        with_shift = self._window.is_pressed(ti.ui.SHIFT)
+    def _key_down(self, key: str, with_shift: bool, controls: Controls) -> None:
         if key == ti.ui.LMB and with_shift and self._over_scene():
             controls.score_under = self.camera.ray(self._cursor)
         elif key == ti.ui.LMB:

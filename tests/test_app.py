@@ -121,7 +121,10 @@ def test_it_leaves_pictures_in_which_the_press_is_seen(pressed):
 
 
 def test_without_a_display_it_runs_headless_by_itself_and_says_so(pressed):
-    assert "No display (DISPLAY is not set): running" in (pressed / "said.txt").read_text()
+    said = (pressed / "said.txt").read_text()
+    assert (
+        "No display (DISPLAY is not set): running" in said and f"Open first: {pressed / 'press.webp'}" in said
+    )
     assert len(list((pressed / "frames").glob("*.png"))) == len(list((pressed / "slices").glob("*.png")))
 
 

@@ -98,7 +98,8 @@ def plan(asked: PlanOptions) -> None:
 
 def plan_resection(asked: PlanOptions) -> None:
     """Propose technique and line of a resection, and write them. Raises CommandError, ResectionError."""
-    from rehearsal.resection.proposal import propose
+    from rehearsal.resection.proposal import propose, why_first
+    from rehearsal.resection.resection_page import draw_page, figures_of
     from rehearsal.resection.resection_plan import ResectionPlan, planned_cut, write_resection_plan
 
     _, anatomy = load_patient(asked.scene, asked.changes, asked.quality)
@@ -113,9 +114,14 @@ def plan_resection(asked: PlanOptions) -> None:
         ResectionPlan(version=VERSION, anatomy=fingerprint(anatomy), margin_mm=asked.margin_mm, cuts=cuts),
         asked.out,
     )
-    click.echo(table_of(proposals))
+    best, picture = proposals[0], asked.out.with_name(f"{asked.out.name}.png")
+    figures = figures_of(best.cut, best.judgement, anatomy.tumour)
+    draw_page(best.cut, best.judgement, anatomy.tumour, figures, picture, "Planned resection")
+    click.echo("\n".join(filter(None, [table_of(proposals), why_first(proposals)])))
+    if asked.margin_mm > 0:
+        click.echo("An enucleation has no margin: --margin-mm 0 plans one.")
     click.echo(
-        f"Wrote {counted(len(cuts), 'cut')} to {asked.out}; rehearse the first with: {rehearse_command_line(asked.scene, asked.out, asked.probe)}"
+        f"Wrote {counted(len(cuts), 'cut')} to {asked.out}, and a picture of the first to {picture}; rehearse the first with: {rehearse_command_line(asked.scene, asked.out, asked.probe)}"
     )
 
 
@@ -135,7 +141,7 @@ def table_of(proposals: list["Proposal"]) -> str:
         [
             each.settings.technique,
             each.cost_ml,
-            each.judgement.margin.margin_mm.min(),
+            each.judgement.margin.least_mm,
             each.judgement.parenchyma_removed_ml,
             each.judgement.collecting_system_opened_mm2,
             None if each.judgement.vessels is None else len(each.judgement.vessels),

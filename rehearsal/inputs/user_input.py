@@ -12,8 +12,18 @@ from rehearsal.notices import Notices
 from rehearsal.pressed_organ import Step
 from rehearsal.real_time.solver_process import SolverProcess
 from rehearsal.resection.cut import CutSettings
-from rehearsal.resection.operation import cut, mark_under, marks_of_image, places_at_rest, set_marks
+from rehearsal.resection.operation import (
+    LEAST_SEEN,
+    cut,
+    mark_under,
+    marks_of_image,
+    places_at_rest,
+    seen_share,
+    set_marks,
+)
+from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.resection_view import cut_settings
+from rehearsal.resection.score_line import ResectionError
 from rehearsal.resection.script import ResectionScript, ScriptedAction
 from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import set_solver
@@ -25,7 +35,11 @@ from render.viewer import Controls, TissueSettings
 STILL_MM = 1e-3
 Ray = tuple[np.ndarray, np.ndarray]
 # Controls that restore states or act on the organ, and their values when nobody uses them.
-AFTER_ACTION = ("reset", "undo", "redo", "bookmark", "to_bookmark", "score_image", "score_under", "cut_out")
+AFTER_ACTION = (
+    *("reset", "undo", "redo", "bookmark", "to_bookmark"),
+    *("score_image", "score_under", "score_planned", "cut_out"),
+)
+UNSEEN = "tumour surface seen {:.0f} %: the cut keeps no margin from the rest"
 NOTHING = {each.name: each.default for each in fields(Controls) if each.name in AFTER_ACTION}
 
 
@@ -42,6 +56,7 @@ class UserInput:
     tracked: PoseSource | None = None
     script: ResectionScript | None = None
     notices: Notices = field(default_factory=Notices)
+    resection_plan: ResectionPlan | None = None
     _ray: Ray | None = field(default=None, init=False)
     _ray_at_slide: Ray | None = field(default=None, init=False)
     _pace: str = field(default="", init=False)
@@ -92,8 +107,7 @@ class UserInput:
     def _interrupts(self, controls: Controls) -> bool:
         """Whether the controls change more than the pose, or the whole state is to be recorded."""
         restores = (controls.reset, controls.undo, controls.redo, controls.bookmark, controls.to_bookmark)
-        operates = controls.score_image or controls.score_under is not None or controls.cut_out
-        if operates or (self.script is not None and self.script.is_due(self.session.time_s)):
+        if controls.operates or (self.script is not None and self.script.is_due(self.session.time_s)):
             return True
         changes = solver_values(controls.settings) != self._solver_values
         return any(restores) or changes or (self.recorder is not None and self.recorder.is_state_due)
@@ -132,9 +146,10 @@ class UserInput:
         """Note a step that was made."""
         self.session.note_changes("solver", dict(iterations=step.iterations))
         self.session.end_step(step.pose, step.length_s, step.wrench)
-        if step.pace != self._pace:
-            self._pace = step.pace
+        # In the terminal once, not for each length: the panel shows the present one.
+        if bool(step.pace) != bool(self._pace):
             self.notices.post(step.pace or "Steps as they are set again.", on_screen=False)
+        self._pace = step.pace
 
     def after_frame(self) -> None:
         """Let the session's file keep up."""
@@ -172,6 +187,8 @@ class UserInput:
                     self.session, marks_of_image(self.session.rehearsal, float(settings.margin_mm))
                 )
             )
+        elif controls.score_planned:
+            self._act(self._score_planned)
         elif controls.cut_out:
             self._act(lambda: self._cut(cut_settings(settings)))
         elif script_is_due and self.script is not None:
@@ -186,12 +203,26 @@ class UserInput:
         if action.cut is not None:
             self._cut(action.cut)
 
+    def _score_planned(self) -> None:
+        if self.resection_plan is None:
+            raise ResectionError(
+                "no planned line; make a plan with app.py plan --resect, and open it with --plan"
+            )
+        planned = self.resection_plan.best
+        places = places_at_rest(self.session.rehearsal, np.array(planned.marks_mm))
+        set_marks(self.session, places, replaces=True)
+        self.notices.post(
+            f"Planned line: for {planned.technique} with a margin of {self.resection_plan.margin_mm:g} mm; {{technique}} chooses the technique"
+        )
+
     def _cut(self, settings: CutSettings) -> None:
         # Without a CT there are no images that could have shown the tumour.
         coverage = self.session.coverage if self.session.rehearsal.scanner is not None else None
         cut(self.session, settings, None if coverage is None else coverage().is_seen)
         made, judgement = self.session.rehearsal.cut, self.session.rehearsal.judgement
+        seen, is_as_deep = seen_share(self.session.rehearsal), settings.depth_mm is None
         warnings = [
+            *([UNSEEN.format(100 * seen)] if is_as_deep and seen < LEAST_SEEN else []),
             *(made.warnings if made is not None else ()),
             *(judgement.warnings() if judgement is not None else ()),
         ]

@@ -218,7 +218,7 @@ class LiveMeasurements:
             "margin": self._with_band("margin_mm", latest.margin_mm) if latest.in_view else "",
         }
         return found | {
-            "tumour seen": self._share("tumour"),
+            "tumour volume seen": self._share("tumour"),
             f"+{self.margin_mm:.0f} mm seen": self._share("margin"),
         }
 

@@ -129,13 +129,13 @@ def _press(report: dict) -> str:
     if not report["finite"]:
         return "NOT FINITE: the tissue diverged, and there are no figures of it"
     return (
-        f"{report['indentation_max_mm']:.2f} mm deep{_force(report['force_max_n'])}; least volume {100 * report['volume_ratio_min']:.1f} %; "
+        f"indentation {report['indentation_max_mm']:.2f} mm at most{_force(report['force_max_n'])}; least volume {100 * report['volume_ratio_min']:.1f} %; "
         f"penetration at most {report['max_penetration_mm']:.3f} mm; all finite"
     )
 
 
 def _force(most_n: float | None) -> str:
-    return "" if most_n is None else f", with {most_n:.2f} N at most"
+    return "" if most_n is None else f", force {most_n:.2f} N at most"
 
 
 def _error(expected_mm: float | None) -> str:

@@ -95,6 +95,6 @@ def summary_text(summary: dict[str, Any]) -> str:
             f"compression {summary['compression_max_mm']:.1f} mm at most, also by the organ's own weight; "
             f"{summary['over_warning_s']:.1f} s above the limit of {summary['compression_warning_mm']:g} mm",
             *_force(summary["force_max_n"]),
-            f"coverage    {seen or 'none: there is no CT'}{largest}",
+            f"coverage    {f'of the volume: {seen}' if seen else 'none: there is no CT'}{largest}",
         ]
     )

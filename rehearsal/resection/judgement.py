@@ -56,6 +56,11 @@ class MarginMap:
         return np.maximum(self.distance_mm, 0.0)
 
     @property
+    def least_mm(self) -> float:
+        """Least margin [mm], rounded as the report has it: the same in all places that show it with one digit."""
+        return round(float(self.margin_mm.min()), 2)
+
+    @property
     def mean_mm(self) -> float:
         """Mean margin [mm] over the surface."""
         return float(self.area_mm2 @ self.margin_mm / self.area_mm2.sum())
@@ -105,9 +110,9 @@ class Judgement:
         """The figures for ``report.json``."""
         margin, opened, vessels = self.margin, self.collecting_system_opened_mm2, self.vessels
         return dict(
-            margin_min_mm=round(float(margin.margin_mm.min()), 2),
+            margin_min_mm=margin.least_mm,
             margin_mean_mm=round(margin.mean_mm, 2),
-            margin_min_as_cut_mm=round(float(self.margin_as_cut.margin_mm.min()), 2),
+            margin_min_as_cut_mm=self.margin_as_cut.least_mm,
             margin_mean_as_cut_mm=round(self.margin_as_cut.mean_mm, 2),
             **{
                 f"margin_below_{limit:g}_mm2": round(margin.area_below(limit), 1)
@@ -256,7 +261,7 @@ def findings_of(judgement: Judgement) -> dict[str, str]:
     """Name -> figure with its unit, of a cut, for the window."""
     margin, opened = judgement.margin, judgement.collecting_system_opened_mm2
     found = {
-        "least margin": f"{margin.margin_mm.min():.1f} mm",
+        "least margin": f"{margin.least_mm:.1f} mm",
         "positive margin": f"{margin.positive_mm2:.0f} mm2",
         "specimen": f"{judgement.specimen_ml:.1f} ml",
         "parenchyma": f"-{judgement.parenchyma_removed_ml:.1f} ml ({judgement.parenchyma_removed_percent:.1f} %)",

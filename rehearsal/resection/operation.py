@@ -7,24 +7,28 @@ from typing import Any
 
 import igl
 import numpy as np
+import trimesh
 from scipy.spatial import ConvexHull
 
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.resection_state import CutRequest, Resection
-from rehearsal.resection.score_line import ResectionError, places_on
+from rehearsal.resection.score_line import ResectionError, ScoreLine, places_on
 from rehearsal.sessions.session import Session
 from sim.fields import array_of
 from ultrasound.scanner import plane_section
 
 # Which of points at rest (n, 3) [mm] the images have shown so far.
 IsSeen = Callable[[np.ndarray], np.ndarray]
+# A cut by less of the tumour's surface is warned of: it may go through the rest.
+LEAST_SEEN = 0.8
 
 
-def set_marks(session: Session, marks: np.ndarray) -> None:
-    """Add marks (n, 3) at rest [mm] to the score. Raises ResectionError."""
+def set_marks(session: Session, marks: np.ndarray, replaces: bool = False) -> None:
+    """Add marks (n, 3) at rest [mm] to the score, or have them instead of those that are set. Raises ResectionError."""
     rehearsal = session.rehearsal
-    resection = rehearsal.resection.with_marks(marks)
+    before = replace(rehearsal.resection, marks=()) if replaces else rehearsal.resection
+    resection = before.with_marks(marks)
     session.note("marks", [list(mark) for mark in resection.marks])
     rehearsal.set_resection(resection)
 
@@ -42,6 +46,14 @@ def cut(session: Session, settings: CutSettings, is_seen: IsSeen | None) -> None
     request = CutRequest.of(settings, seen, rehearsal.body.snapshot().position)
     rehearsal.set_resection(replace(rehearsal.resection, cut=request))
     session.note("cut", asdict(settings) | dict(seen=base64.b64encode(request.seen).decode("ascii")))
+
+
+def seen_share(rehearsal: Rehearsal) -> float:
+    """The share of the tumour's surface that the images had shown when it was cut; 1 without a cut or a tumour."""
+    request, tumour = rehearsal.resection.cut, rehearsal.whole_tumour
+    if request is None or tumour is None:
+        return 1.0
+    return float(request.seen_of(len(tumour.vertices)).mean())
 
 
 def repeat_cut(rehearsal: Rehearsal, recorded: dict[str, Any]) -> None:
@@ -119,11 +131,10 @@ def _surface_now(rehearsal: Rehearsal) -> tuple[np.ndarray, np.ndarray]:
     return array_of(rehearsal.organ_skin.vertices).astype(float), np.asarray(rehearsal.organ.faces, np.int64)
 
 
-def distance_to_tumour(rehearsal: Rehearsal) -> np.ndarray:
-    """Distance (k,) [mm] of each point of the score at rest from the outline of the tumour, both seen along the score's direction; negative over
-    the tumour. Empty without a score or a tumour.
+def distance_to_tumour(line: ScoreLine | None, tumour: trimesh.Trimesh | None) -> np.ndarray:
+    """Distance (k,) [mm] of each point of a score at rest from the outline of a tumour, both seen along the score's direction; negative over the
+    tumour. Empty without a score or a tumour.
     """
-    line, tumour = rehearsal.score, rehearsal.whole_tumour
     if line is None or tumour is None:
         return np.zeros(0)
     axes = line.frame()[:2]

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
 
-from rehearsal.resection.cut import CutSettings, cut_organ, grown
+from rehearsal.resection.cut import Cut, CutSettings, cut_organ, grown
 from rehearsal.resection.judgement import Carried, Judgement, judge
 from rehearsal.resection.score_line import ResectionError, ScoreLine, places_on, score_line
 from scenes.anatomy import Grid
@@ -78,11 +78,15 @@ def line_around(
 
 @dataclass(frozen=True)
 class Proposal:
-    """A technique and a line, with the figures of the cut in the patient at rest; ``cost_ml`` is what it takes, in ml of parenchyma."""
+    """A cut of the patient at rest, with its figures; ``cost_ml`` is what it takes, in ml of parenchyma."""
 
-    settings: CutSettings
-    line: ScoreLine
+    cut: Cut
     judgement: Judgement
+
+    @property
+    def settings(self) -> CutSettings:
+        """Technique and margin."""
+        return self.cut.settings
 
     @property
     def cost_ml(self) -> float:
@@ -90,13 +94,39 @@ class Proposal:
         return cost_ml(self.judgement, self.settings.margin_mm)
 
 
-def cost_ml(judgement: Judgement, margin_mm: float) -> float:
-    """Parenchyma removed [ml]; an opened collecting system, divided vessels, and margin that is missing count as so many ml more."""
-    opened = OPENED_ML_MM2 * (judgement.collecting_system_opened_mm2 or 0.0)
-    vessels = VESSEL_ML_MM2 * sum(np.pi / 4 * vessel.diameter_mm**2 for vessel in judgement.vessels or ())
+def cost_terms(judgement: Judgement, margin_mm: float) -> dict[str, float]:
+    """Parenchyma removed [ml], and what counts as so many ml more: an opened collecting system, divided vessels, missing and positive margin."""
     missing = max(margin_mm - float(judgement.margin.margin_mm.min()) - KEPT_WITHIN_MM, 0.0)
-    left = LEFT_ML_MM2 * judgement.margin.positive_mm2
-    return judgement.parenchyma_removed_ml + opened + vessels + MISSING_ML_MM * missing + left
+    return {
+        "parenchyma": judgement.parenchyma_removed_ml,
+        "collecting system": OPENED_ML_MM2 * (judgement.collecting_system_opened_mm2 or 0.0),
+        "vessels": VESSEL_ML_MM2
+        * sum(np.pi / 4 * vessel.diameter_mm**2 for vessel in judgement.vessels or ()),
+        "missing margin": MISSING_ML_MM * missing,
+        "positive margin": LEFT_ML_MM2 * judgement.margin.positive_mm2,
+    }
+
+
+def cost_ml(judgement: Judgement, margin_mm: float) -> float:
+    """What a cut takes, in ml of parenchyma: the sum of its ``cost_terms``."""
+    return sum(cost_terms(judgement, margin_mm).values())
+
+
+def why_first(proposals: list[Proposal]) -> str:
+    """Why the first of proposals comes before the second, in a sentence; empty where there is no second."""
+    if len(proposals) < 2:
+        return ""
+    first, second = proposals[:2]
+    costs = [cost_terms(each.judgement, each.settings.margin_mm) for each in (first, second)]
+    differing = [
+        f"{name} {a:.1f} instead of {b:.1f}"
+        for (name, a), b in zip(costs[0].items(), costs[1].values(), strict=True)
+        if f"{a:.1f}" != f"{b:.1f}"
+    ]
+    return (
+        f"The first, {first.settings.technique}, costs {second.cost_ml - first.cost_ml:.1f} points less than the next"
+        f"{': ' * bool(differing)}{', '.join(differing)}."
+    )
 
 
 def propose(
@@ -127,7 +157,7 @@ def propose(
                 at_rest, specimen=np.asarray(cut.specimen.vertices), remnant=np.asarray(cut.remnant.vertices)
             )
             judged = judge(cut, organ, tumour, parts, carried, labels, tissues)
-            found.append(Proposal(each, line, judged))
+            found.append(Proposal(cut, judged))
     if not found:
         raise ResectionError(
             f"no cut with a margin of {margin_mm:g} mm around this tumour leaves most of the kidney; choose a smaller margin"

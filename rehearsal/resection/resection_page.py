@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
@@ -15,60 +16,84 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.cut import Cut
 from rehearsal.resection.judgement import MARGIN_LIMITS_MM, NOT_LABELLED, Judgement
+from rehearsal.resection.operation import distance_to_tumour, seen_share
+from rehearsal.resection.proposal import KEPT_WITHIN_MM
 from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.score_line import ResectionError
 from rehearsal.result_files import counted, save_figure, write_json
+from render.background_image import ends_of
 from scenes.surfaces import signed_distance_from
 
 NAME = "resection"
+NOTHING_CUT = "nothing was cut, or there is no tumour to judge by"
 # Colours of the margin: in the tumour, then up to each limit, then beyond the last.
 COLOURS = ("#7a0016", "#e5383b", "#ef8a00", "#ffd60a", "#52b483")
 CAPSULE = "#d1caca"
 # Views of the specimen along the axes of the score's frame: title, direction from which it is seen, and what is up.
-VIEWS = (("resection surface, from below", (0, 0, -1), (0, 1, 0)), ("from the side", (0, -1, 0), (0, 0, 1)))
+VIEWS = (
+    ("specimen from below: resection surface", (0, 0, -1), (0, 1, 0)),
+    ("specimen from the side", (0, -1, 0), (0, 0, 1)),
+)
+NEAR_END, FAR_END = "#222222", "#a6a6a6"
 TEXT_WIDTH = 40
 LIGHT = np.array([0.4, 0.6, 0.7])
 
 
-def report_of(rehearsal: Rehearsal, plan: ResectionPlan | None = None) -> dict[str, Any]:
-    """The figures of a cut, how it was made, and its comparison with a plan, for ``report.json``. Raises ResectionError without a cut."""
-    judgement, request = rehearsal.judgement, rehearsal.resection.cut
-    if judgement is None or request is None:
-        raise ResectionError("nothing was cut, or there is no tumour to judge by")
-    asked = request.settings
-    tumour = rehearsal.whole_tumour
-    seen = 0.0 if tumour is None else float(request.seen_of(len(tumour.vertices)).mean())
+def figures_of(
+    cut: Cut, judgement: Judgement, tumour: trimesh.Trimesh, seen_percent: float | None = None
+) -> dict[str, Any]:
+    """The figures of a cut, and how it was made; ``seen_percent`` of the tumour's surface was seen, None where no image was."""
+    asked = cut.settings
     return dict(
         technique=asked.technique,
         margin_asked_mm=asked.margin_mm,
         depth_mm=asked.depth_mm,
         filling=asked.filling,
-        tumour_seen_percent=round(100 * seen, 1),
+        tumour_seen_percent=seen_percent,
+        score_to_tumour_mm=round(float(distance_to_tumour(cut.line, tumour).min()), 2),
         **judgement.report(),
-        **({} if plan is None else dict(against_plan=plan.compared(judgement))),
     )
+
+
+def report_of(rehearsal: Rehearsal, plan: ResectionPlan | None = None) -> dict[str, Any]:
+    """The figures of a cut, how it was made, and its comparison with a plan, for ``report.json``. Raises ResectionError without a cut."""
+    cut, judgement, tumour = rehearsal.cut, rehearsal.judgement, rehearsal.whole_tumour
+    if cut is None or judgement is None or tumour is None:
+        raise ResectionError(NOTHING_CUT)
+    seen_percent = round(100 * seen_share(rehearsal), 1)
+    compared = {} if plan is None else dict(against_plan=plan.compared(judgement))
+    return figures_of(cut, judgement, tumour, seen_percent) | compared
 
 
 def save_page(rehearsal: Rehearsal, report: dict[str, Any], out: Path) -> list[Path]:
     """Write ``resection.png`` and ``resection.json`` with a report into a folder; return them. Raises ResectionError, OSError."""
-    cut, judgement = rehearsal.cut, rehearsal.judgement
-    if cut is None or judgement is None or rehearsal.whole_tumour is None:
-        raise ResectionError("nothing was cut, or there is no tumour to judge by")
+    cut, judgement, tumour = rehearsal.cut, rehearsal.judgement, rehearsal.whole_tumour
+    if cut is None or judgement is None or tumour is None:
+        raise ResectionError(NOTHING_CUT)
+    page, figures = out / f"{NAME}.png", out / f"{NAME}.json"
+    draw_page(cut, judgement, tumour, report, page, "Resection")
+    write_json(report, figures)
+    return [page, figures]
+
+
+def draw_page(
+    cut: Cut, judgement: Judgement, tumour: trimesh.Trimesh, report: dict[str, Any], path: Path, title: str
+) -> None:
+    """Draw the page of a cut with its report as PNG. Raises OSError."""
     figure = Figure(figsize=(13.5, 6.0), facecolor="white")
     FigureCanvasAgg(figure)
+    figure.text(0.03, 0.93, f"{title}: the specimen, coloured by its margin", fontsize=17, weight="bold")
     faces = np.asarray(cut.specimen.vertices)[np.asarray(cut.specimen.faces)]
-    distance = signed_distance_from(rehearsal.whole_tumour, faces.mean(axis=1))
-    colours = _colours(distance, cut)
-    for place, (title, eye, up) in enumerate(VIEWS):
+    colours = _colours(signed_distance_from(tumour, faces.mean(axis=1)), cut)
+    for place, (name, eye, up) in enumerate(VIEWS):
         axes = figure.add_axes((0.01 + 0.3 * place, 0.14, 0.3, 0.76), projection="3d")
-        _draw_specimen(axes, faces @ _axes(cut, eye, up).T, colours, title)
+        seen = _axes(cut, eye, up)
+        _draw_specimen(axes, faces @ seen.T, colours, name)
+        _draw_compass(figure.add_axes((0.02 + 0.3 * place, 0.12, 0.07, 0.158)), seen)
     lowest = _draw_figures(figure, report)
     _draw_histogram(figure.add_axes((0.67, 0.12, 0.31, min(0.28, lowest - 0.15))), judgement)
     _draw_legend(figure)
-    page, figures = out / f"{NAME}.png", out / f"{NAME}.json"
-    save_figure(figure, page, dpi=110)
-    write_json(report, figures)
-    return [page, figures]
+    save_figure(figure, path, dpi=110)
 
 
 def _axes(cut: Cut, eye: tuple[int, int, int], up: tuple[int, int, int]) -> np.ndarray:
@@ -105,6 +130,18 @@ def _draw_specimen(axes: Any, faces: np.ndarray, colours: np.ndarray, title: str
     axes.set_title(title, fontsize=12)
 
 
+def _draw_compass(axes: Axes, seen: np.ndarray) -> None:
+    """Draw the patient's axes by their letters, for a view's axes right, up, towards the eye (3, 3); ends towards the eye are dark."""
+    ends = ends_of(seen * [[1], [1], [-1]])
+    for place, (letter, end) in enumerate(ends):
+        colour = NEAR_END if place >= len(ends) / 2 else FAR_END
+        axes.plot([0, end[0]], [0, end[1]], color=colour, linewidth=1.2)
+        beyond = end * (1 + 0.35 / np.linalg.norm(end))
+        axes.text(beyond[0], beyond[1], letter, fontsize=10, color=colour, ha="center", va="center")
+    axes.set(xlim=(-1.4, 1.4), ylim=(-1.4, 1.4), aspect="equal")
+    axes.set_axis_off()
+
+
 def _draw_histogram(axes: Axes, judgement: Judgement) -> None:
     """Draw the area of the resection surface by its margin."""
     margin, area = judgement.margin.distance_mm, judgement.margin.area_mm2
@@ -138,7 +175,6 @@ def _draw_legend(figure: Figure) -> None:
 def _draw_figures(figure: Figure, report: dict[str, Any]) -> float:
     """Write the figures, and return the height below the last one, as a share of the page."""
     rows = rows_of(report)
-    figure.text(0.03, 0.93, "Resection", fontsize=17, weight="bold")
     height = 0.93
     for name, value in rows:
         figure.text(0.62, height, name, fontsize=10.5, color="#555555", va="top")
@@ -148,9 +184,31 @@ def _draw_figures(figure: Figure, report: dict[str, Any]) -> float:
     return height
 
 
+def why_less(report: dict[str, Any]) -> list[tuple[str, str]]:
+    """Why the least margin is below the one that was asked for, as a row; none where it is not."""
+    asked, line, seen = (
+        report[name] for name in ("margin_asked_mm", "score_to_tumour_mm", "tumour_seen_percent")
+    )
+    if report["margin_min_mm"] >= asked - KEPT_WITHIN_MM:
+        return []
+    reasons = []
+    if report["depth_mm"] is not None:
+        reasons.append("the depth was set")
+    elif report["technique"] == "enucleation":
+        reasons.append("an enucleation has no margin")
+    elif seen is not None and seen < 100:
+        reasons.append("kept only from the tumour surface seen")
+    if line < asked:
+        reasons.append(f"the score is {line:.1f} mm from the tumour")
+    if report["technique"] == "wedge":
+        reasons.append("the walls of a wedge are straight")
+    return [("less than asked", "; ".join(reasons))] if reasons else []
+
+
 def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
     """Names and values of a report, for the page and the terminal."""
-    depth = "as deep as seen" if report["depth_mm"] is None else f"{report['depth_mm']:g} mm deep"
+    depth = "to the tumour's depth" if report["depth_mm"] is None else f"{report['depth_mm']:g} mm deep"
+    seen = report["tumour_seen_percent"]
     opened, divided = report["collecting_system_opened_mm2"], report["vessels"]
     vessels = [f"{each['tissue']} {each['diameter_mm']:.1f} mm" for each in divided or []]
     shown = ", ".join(vessels[:3]) + (f" and {len(vessels) - 3} more" if len(vessels) > 3 else "")
@@ -169,13 +227,14 @@ def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
     )
     return [
         ("technique", f"{report['technique']}, {depth}; {report['filling']} in the crater"),
-        ("tumour seen", f"{report['tumour_seen_percent']:.0f} % of its surface"),
+        *([] if seen is None else [("tumour surface seen", f"{seen:.0f} %")]),
         (
             "margin",
             f"{report['margin_min_mm']:.1f} mm least, {report['margin_mean_mm']:.1f} mm mean; asked {report['margin_asked_mm']:g}",
         ),
+        *why_less(report),
         (
-            "in the tissue as cut",
+            "margin, tissue as cut",
             f"{report['margin_min_as_cut_mm']:.1f} mm least, {report['margin_mean_as_cut_mm']:.1f} mm mean",
         ),
         (f"area below {limits} mm", f"{below} mm2"),

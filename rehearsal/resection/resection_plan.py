@@ -98,13 +98,13 @@ def planned_cut(proposal: Proposal, origin: np.ndarray) -> PlannedCut:
     def places(points: np.ndarray) -> list[Place]:
         return [(x, y, z) for x, y, z in np.round(points + origin, 3).tolist()]
 
-    x, y, z = np.round(proposal.line.direction, 4).tolist()
+    x, y, z = np.round(proposal.cut.line.direction, 4).tolist()
     return PlannedCut(
         technique=proposal.settings.technique,
         cost_ml=round(proposal.cost_ml, 3),
         direction=(x, y, z),
-        marks_mm=places(proposal.line.marks),
-        line_mm=places(proposal.line.points),
+        marks_mm=places(proposal.cut.line.marks),
+        line_mm=places(proposal.cut.line.points),
         figures=proposal.judgement.report(),
     )
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.cut import Cut, CutSettings, cut_organ
-from rehearsal.resection.operation import IsSeen, distance_to_tumour
+from rehearsal.resection.operation import LEAST_SEEN, IsSeen, distance_to_tumour
 from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.score_line import ResectionError
 from render.viewer import Score, Settings
@@ -30,7 +30,8 @@ def cut_settings(settings: Settings) -> CutSettings:
 class ResectionView:
     """The score and the coming resection surface of a rehearsal.
 
-    ``plan`` is what is to be followed, if anything. ``fault`` says why a cut is not possible now; ``tumour_mm`` (k,) are the distances of the score's points from the tumour's outline.
+    ``plan`` is what is to be followed, if anything. ``fault`` says why a cut is not possible now; ``tumour_mm`` (k,) are the distances of the score's points from the
+    tumour's outline, ``seen_share`` is the share of the tumour's surface that the images have shown.
     """
 
     def __init__(self, rehearsal: Rehearsal, plan: ResectionPlan | None = None) -> None:
@@ -41,6 +42,7 @@ class ResectionView:
             self._plan_skin = Skin(rehearsal.model, line)
         self.fault = ""
         self.tumour_mm = np.zeros(0)
+        self.seen_share = 1.0
         self._planned: Cut | None = None
         # Nodes and weights of the vertices of the coming specimen. Not a skin, of which there would be one for each change.
         self._carried_by: tuple[np.ndarray, np.ndarray] = np.zeros((0, 8), int), np.zeros((0, 8))
@@ -57,12 +59,13 @@ class ResectionView:
         if of == self._of:
             return
         seen = is_seen(points)
+        self.seen_share = float(seen.mean()) if len(seen) else 1.0
         has_news = of[:3] != self._of[:3] or seen.tobytes() != self._seen
         self._of, self._seen = of, seen.tobytes()
         if not has_news:
             return
         self.fault, self._planned = self.rehearsal.score_fault, None
-        self.tumour_mm = distance_to_tumour(self.rehearsal)
+        self.tumour_mm = distance_to_tumour(self.rehearsal.score, tumour)
         line, model = self.rehearsal.score, self.rehearsal.model
         if line is None or resection.cut is not None or not isinstance(model, NeoHookean):
             return
@@ -99,13 +102,15 @@ class ResectionView:
         if count == 0 or self.rehearsal.cut is not None:
             return ""
         line = self.rehearsal.score
-        parts = [
-            f"SCORE {count} marks" + ("" if line is None else f" {line.length_mm:.0f} mm"),
-            settings.technique,
-        ]
+        # Warnings first: of what is too long for the panel, the last is not shown.
+        parts = []
         if self.fault:
             # The reason; what to do about it is said where a cut is refused.
             parts.append(self.fault.partition(";")[0])
+        if settings.depth_mm is None and self.seen_share < LEAST_SEEN:
+            parts.append(f"tumour surface seen {100 * self.seen_share:.0f} %")
         if len(self.tumour_mm) and self.tumour_mm.min() < settings.margin_mm - TOLERANCE_MM:
-            parts.append(f"{self.tumour_mm.min():.1f} of {settings.margin_mm:.0f} mm margin")
+            parts.append(f"red: {self.tumour_mm.min():.1f} of {settings.margin_mm:.0f} mm margin")
+        parts.append(f"SCORE {count} marks" + ("" if line is None else f" {line.length_mm:.0f} mm"))
+        parts.append(settings.technique)
         return "   ".join(parts)

@@ -96,7 +96,7 @@ def test_what_a_session_holds_is_recalled_as_it_was_watched(watching, rehearsal,
     assert again.figures() == watching.figures() and again.summary(2) == watching.summary(2)
     assert (again.course.presses, again.course.went_back, again.guide.next_pose) == (1, 1, 4)
     view = again.onto(View(np.eye(4), {}, 40.0, 60.0), Settings(show_seen=True))
-    assert view.findings["tumour seen"] == "100 %" and view.seen["tumour"].any()
+    assert view.findings["tumour volume seen"] == "100 %" and view.seen["tumour"].any()
     del log.events[1][0].value["contact_mm2"]
     with pytest.raises(SessionError, match="without compression or contact"):
         LiveMeasurements(rehearsal).recall(log, 5)

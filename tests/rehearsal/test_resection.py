@@ -11,8 +11,12 @@ import trimesh
 from coarse_patient import coarse_patient
 from conftest import ROOT
 
+from rehearsal.asked_files import read_files
+from rehearsal.commands.command_line import CommandError
+from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.measurements.live_measurements import LiveMeasurements
+from rehearsal.open_window import geometry_of
 from rehearsal.resection import proposal
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.judgement import findings_of
@@ -24,8 +28,8 @@ from rehearsal.resection.operation import (
     places_at_rest,
     set_marks,
 )
-from rehearsal.resection.proposal import line_around, propose
-from rehearsal.resection.resection_page import report_of, rows_of, save_page
+from rehearsal.resection.proposal import line_around, propose, why_first
+from rehearsal.resection.resection_page import draw_page, figures_of, report_of, rows_of, save_page, why_less
 from rehearsal.resection.resection_plan import (
     ResectionPlan,
     ResectionPlanError,
@@ -129,8 +133,11 @@ def test_a_cut_keeps_the_margin_and_undo_brings_all_back_bit_for_bit(rehearsal, 
     assert np.isfinite(array_of(rehearsal.body.position)).all()
     assert rehearsal.volume_ratio() == pytest.approx(1.0, abs=0.01)
     assert findings_of(judged)["specimen"].endswith("ml")
+    assert len(geometry_of(rehearsal).bed[1]) == cut.on_remnant.sum() > 100
     moved(live, undo=True)
-    assert rehearsal.cut is None and len(rehearsal.resection.marks) == len(marks)
+    assert rehearsal.cut is geometry_of(rehearsal).bed is None and len(rehearsal.resection.marks) == len(
+        marks
+    )
     moved(live, undo=True)
     assert rehearsal.resection == NO_RESECTION and rehearsal.cut is rehearsal.judgement is None
     assert rehearsal.digest() == before and rehearsal.organ is rehearsal.whole_organ
@@ -226,6 +233,10 @@ def test_what_cannot_be_done_is_refused_in_words(rehearsal, marks):
     )
     moved(live, 2)
     assert "no part of the tumour was seen" in live.notices.present(lambda words: words)[0]
+    every_other = SimpleNamespace(is_seen=lambda points: np.arange(len(points)) % 2 == 0)
+    live = acting(rehearsal, ScriptedAction(0.0, cut=CutSettings()), coverage=lambda: every_other)
+    moved(live)
+    assert rehearsal.cut is not None and "tumour surface seen 50 %" in live.notices.present()[0]
 
 
 def test_a_cut_through_the_hilum_is_refused(rehearsal):
@@ -335,9 +346,9 @@ def test_the_distance_of_a_line_to_the_tumour_is_negative_over_it():
         frame=lambda: np.eye(3), points=np.array([[0.0, 0, 9], [5, 0, 9], [8, 0, 9], [8, 9, 9]])
     )
     tumour = trimesh.creation.box([10.0, 10.0, 10.0])
-    found = distance_to_tumour(SimpleNamespace(score=line, whole_tumour=tumour))
+    found = distance_to_tumour(line, tumour)
     assert found == pytest.approx([-5.0, 0.0, 3.0, 5.0], abs=1e-12)
-    assert len(distance_to_tumour(SimpleNamespace(score=line, whole_tumour=None))) == 0
+    assert len(distance_to_tumour(line, None)) == 0
 
 
 def test_the_view_warns_of_a_line_that_is_too_near_and_shows_the_coming_cut(rehearsal, marks):
@@ -351,12 +362,16 @@ def test_the_view_warns_of_a_line_that_is_too_near_and_shows_the_coming_cut(rehe
     score = shown.score(MARGIN_MM)
     assert not score.is_near.any() and "margin" not in shown.status(CutSettings())
     # Between marks a geodesic may be nearer than they are, by the sagitta of their arc.
-    assert distance_to_tumour(rehearsal).min() > MARGIN_MM - 0.5
+    assert distance_to_tumour(rehearsal.score, rehearsal.whole_tumour).min() > MARGIN_MM - 0.5
     assert shown.score(MARGIN_MM + 2.0).is_near.all()
+    assert "red: " in shown.status(CutSettings(margin_mm=MARGIN_MM + 2.0))
     assert f"{rehearsal.score.length_mm:.0f} mm" in shown.status(CutSettings())
+    assert "seen" not in shown.status(CutSettings())
     seen.seen[:] = False
     shown.update(CutSettings(), seen.is_seen, 1.0)
     assert "no part of the tumour was seen" in shown.status(CutSettings())
+    assert "tumour surface seen 0 %" in shown.status(CutSettings())
+    assert "surface seen" not in shown.status(CutSettings(depth_mm=12.0))
     assert shown.section(np.eye(4)) is None
     seen.seen[:] = True
     shown.update(CutSettings(), seen.is_seen, 2.0)
@@ -390,20 +405,51 @@ def test_it_is_cut_but_once_and_page_score_and_plan_are_written_and_compared(
     costs = [each.cost_ml for each in proposals]
     assert len(costs) > 1 and costs == sorted(costs) and proposals[0].settings.technique == "enucleoresection"
     assert proposals[0].judgement.margin.margin_mm.min() > MARGIN_MM - 0.1
+    why = why_first(proposals)
+    assert why.startswith(
+        f"The first, enucleoresection, costs {costs[1] - costs[0]:.1f} points less than the next: "
+    )
+    assert why_first(proposals[:1]) == "" and "None" not in why
+    best = proposals[0]
+    figures = figures_of(best.cut, best.judgement, anatomy.tumour)
+    assert (
+        "tumour surface seen" not in dict(rows_of(figures))
+        and figures["score_to_tumour_mm"] > MARGIN_MM - 0.5
+    )
+    draw_page(best.cut, best.judgement, anatomy.tumour, figures, tmp_path / "plan.png", "Planned resection")
+    assert (tmp_path / "plan.png").stat().st_size > 10_000
     cuts = [planned_cut(each, np.zeros(3)) for each in proposals]
     plan, path = ResectionPlan(anatomy="a", margin_mm=MARGIN_MM, cuts=cuts), tmp_path / "plan.json"
     write_resection_plan(plan, path)
     assert is_resection_plan(path) and read_resection_plan(path) == plan
+    with pytest.raises(CommandError, match="the scripted press cuts nothing; open it in a window, or add"):
+        read_files(RehearseOptions(headless=True, plan=path))
+    assert read_files(RehearseOptions(plan=path)).resection_plan == plan
     report = report_of(rehearsal, plan)
     # The rehearsed line is the planned one.
     assert report["against_plan"]["parenchyma_removed_ml_more"] == pytest.approx(0.0, abs=0.05)
     page, figures = save_page(rehearsal, report, tmp_path)
     assert page.stat().st_size > 10_000 and json.loads(figures.read_text()) == report
     assert dict(rows_of(report))["positive margin"].startswith("0 mm2")
+    assert why_less(report) == []
+    less = report | dict(margin_min_mm=3.9, score_to_tumour_mm=4.8)
+    assert why_less(less) == [("less than asked", "the score is 4.8 mm from the tumour")]
+    assert (
+        "surface seen; the score" in dict(rows_of(less | dict(tumour_seen_percent=53.4)))["less than asked"]
+    )
     curve = json.loads(save_score(rehearsal, tmp_path).read_text())["markups"][0]
     points = np.array([point["position"] for point in curve["controlPoints"]])
     assert curve["type"] == "ClosedCurve" and curve["coordinateSystem"] == "LPS"
     assert np.abs(signed_distance_from(anatomy.organ, points)).max() < 0.3
+    rehearsal.reset()
+    live = UserInput(Session(rehearsal), resection_plan=plan)
+    set_marks(live.session, marks[:3])
+    moved(live, score_planned=True)
+    assert np.abs(rehearsal.score.points + rehearsal.origin - np.array(plan.best.line_mm)).max() < 0.05
+    assert "for enucleoresection with a margin of 5 mm" in live.notices.present()[0]
+    live = UserInput(Session(rehearsal))
+    moved(live, score_planned=True)
+    assert "no planned line; make a plan" in live.notices.present()[0]
     whole = path.read_text()
     path.write_text(whole.replace('"margin_min_mm"', '"margin_minimum_mm"'))
     with pytest.raises(ResectionPlanError, match="margin_min_mm is no number"):

@@ -54,4 +54,8 @@ def test_figures_are_those_of_tissue_that_is_there(one_device, lost):
     assert report["probe_torque_n_mm"] == ([1.0, 2.0, 3.0] if lost is None else None)
     assert "parts     tumour 60 kPa (nu 0.4)" in summary(report)
     (press,) = (line for line in summary(report).splitlines() if line.startswith("press"))
-    assert ("3.50 mm deep, with 0.50 N at most" in press) == (lost is None) != ("NOT FINITE" in press)
+    assert (
+        ("indentation 3.50 mm at most, force 0.50 N at most" in press)
+        == (lost is None)
+        != ("NOT FINITE" in press)
+    )

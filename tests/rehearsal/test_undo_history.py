@@ -374,7 +374,7 @@ def test_the_iterations_that_were_done_are_recorded_not_those_asked_for():
 
 def test_a_pace_that_differs_is_said_once(capsys):
     live = live_of()
-    for pace in ("", "LONGER STEPS   1/30 s", "LONGER STEPS   1/30 s", ""):
+    for pace in ("", "LONGER STEPS   1/30 s", "LONGER STEPS   1/15 s", ""):
         step(live, pace=pace)
         assert live.status == pace and live.notices.present() == []
     assert capsys.readouterr().out == "LONGER STEPS   1/30 s\nSteps as they are set again.\n"

@@ -482,6 +482,27 @@ def test_a_button_that_is_pressed_again_within_a_slow_frame_stays_pressed(window
     assert not opened.read_controls().press
 
 
+def test_shift_counts_for_the_keys_pressed_with_it_also_in_a_slow_frame(window, mouse):
+    import taichi as ti
+
+    opened, _, _ = window
+
+    def cuts(*presses: str, releases: tuple[str, ...] = ()) -> tuple[bool, bool]:
+        """Whether the frame cuts along the score, and whether it toggles the section of the view."""
+        before = opened.settings.cut
+        for key in presses:
+            mouse.presses(key)
+        for key in releases:
+            mouse.releases(key)
+        return opened.read_controls().cut_out, opened.settings.cut != before
+
+    assert cuts("x", releases=("x",)) == (False, True)
+    assert cuts(ti.ui.SHIFT, "x", releases=("x", ti.ui.SHIFT)) == (True, False)
+    assert cuts("x", ti.ui.SHIFT, releases=("x",)) == (False, True)
+    assert cuts("x", releases=("x", ti.ui.SHIFT)) == (True, False)
+    assert cuts("x", releases=("x",)) == (False, True)
+
+
 def test_other_geometry_has_its_own_sliders(window):
     opened, field, _ = window
     faces = opened._geometry.organ[1]
@@ -490,6 +511,18 @@ def test_other_geometry_has_its_own_sliders(window):
     opened.change_geometry(dataclasses.replace(opened._geometry, tumour=(field, faces)))
     after = opened.picture()
     assert np.any(before != after, axis=2)[opened.layout.strip.slices].any()
+
+
+@pytest.mark.parametrize("translucent", [False, True])
+def test_the_bed_of_a_cut_is_solid_in_a_translucent_organ(window, translucent):
+    opened, field, _ = window
+    faces = opened._geometry.organ[1]
+    opened.settings.translucent = translucent
+    opened.draw(_far_view())
+    before = opened.picture().astype(int)
+    opened.change_geometry(dataclasses.replace(opened._geometry, bed=(field, faces[: len(faces) // 2])))
+    brighter = (opened.picture() - before).max(axis=2) > 20
+    assert brighter[opened.layout.clear.slices].any() == translucent
 
 
 @pytest.mark.parametrize(("setting", "value"), [("translucent", True), ("cut", True), ("level_hu", 90)])

@@ -209,9 +209,9 @@ def test_the_mouse_moves_and_presses_the_transducer(screen):
         screen.do("mousedown", 1)
         time.sleep(0.5)
         screen.do("mouseup", 1)
-    screen.picture()
-    # Not before the picture shows the last mark: a slow window would see its click without shift.
+    # At once: also a slow window sees the last click with shift.
     screen.do("keyup", "Shift_L")
+    screen.picture()
     screen.do("key", "--window", screen.window, "Escape")
     assert screen.program.wait(timeout=20) == 0
     lines = (screen.out / "session-001.jsonl").read_text().splitlines()
