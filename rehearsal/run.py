@@ -228,7 +228,7 @@ class RehearsalRun:
         """Write the page of the resection, and print its figures."""
         from rehearsal.resection.resection_page import rows_of, save_page
 
-        click.echo("\n".join(f"{name:<20}  {value}" for name, value in rows_of(report)))
+        click.echo("\n".join(f"{name:<21}  {value}" for name, value in rows_of(report)))
         try:
             click.echo("Saved " + " and ".join(map(str, save_page(self.rehearsal, report, self.asked.out))))
         except OSError as error:
