@@ -5,7 +5,6 @@ from typing import Any
 
 import click
 from PIL import Image
-from tqdm import tqdm
 
 from rehearsal.frame import Frames
 from rehearsal.image_and_surface_files import save_image_file, save_surfaces
@@ -19,6 +18,7 @@ from render.animation import ANIMATION_FPS, empty_folder, save_animation, scaled
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan, Window
 from scenes.atomic_files import atomic_write
+from scenes.terminal import bar
 
 # An animation is held in memory: a long session has fewer images in it.
 MOST_SHOWN = 240
@@ -83,7 +83,7 @@ def run_headless(
     """
     rehearsal, tally = frames.rehearsal, frames.tally
     pictures = Pictures(rehearsal, steps, out) if draws else None
-    for step in tqdm(range(1, steps + 1), desc="press", unit="step"):
+    for step in bar(range(1, steps + 1), "press"):
         pose = frames.input(Controls(settings))
         frames.step(pose)
         probe = probe_with_settings(rehearsal.probe, settings)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-import click
+from tqdm import tqdm
 
 
 class Notices:
@@ -22,7 +22,8 @@ class Notices:
         shown = []
         for text, on_screen, in_terminal in queue:
             if in_terminal:
-                click.echo(worded(text))
+                # Not beside a progress bar, on its line.
+                tqdm.write(worded(text))
             if on_screen:
                 shown.append(worded(text))
         return shown

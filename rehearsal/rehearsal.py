@@ -13,13 +13,12 @@ import trimesh
 from errors import PatientError
 from rehearsal.build_solver import embedding_cell_mm
 from rehearsal.pressed_organ import OrganState, PressedOrgan
-from rehearsal.resection.cut import Cut, cut_organ, part_left
+from rehearsal.resection.cut import Cut, check_hilum, cut_organ, hilum_of, part_left
 from rehearsal.resection.judgement import Carried, Judgement, judge
 from rehearsal.resection.resection_state import NO_RESECTION, Resection
 from rehearsal.resection.score_line import LEAST_MARKS, ResectionError, ScoreLine, score_line
 from scenes.anatomy import Grid, LoadedAnatomy
 from scenes.scene import Scene
-from scenes.solids import solid_of
 from scenes.surfaces import translated, volume_mm3
 from scenes.terminal import ReportProgress, no_progress
 from sim.embedding import Embedding
@@ -45,8 +44,6 @@ SUPPORT_SUNK_MM = 0.4
 SURROUNDINGS_MM = 25.0
 # Points along each side of an image whose rest positions are computed.
 REST_PLACES = 48
-# Largest share of the tissue that the hilum's vessels hold that a cut may remove.
-MOST_OF_HILUM = 0.25
 # Gap between the organ and the specimen beside it.
 BESIDE_MM = 8.0
 TUMOUR = "tumour"
@@ -238,23 +235,9 @@ class Rehearsal(PressedOrgan):
             tumour = np.zeros((0, 3)) if self.whole_tumour is None else np.asarray(self.whole_tumour.vertices)
             seen = tumour[resection.cut.seen_of(len(tumour))]
             made = cut_organ(self.whole_organ, line, resection.cut.settings, seen)
-            self._check_hilum(made)
+            check_hilum(made, self.whole_organ, hilum_of(self.scene.attachment, self.origin))
             self._cuts = dict([*self._cuts.items(), (resection, made)][-KEPT_CUTS:])
         return self._cuts[resection]
-
-    def _check_hilum(self, cut: Cut) -> None:
-        """Raises ResectionError where the specimen would contain much of the tissue around the hilum."""
-        place, radius_mm = self.scene.attachment.at_mm, self.scene.attachment.radius_mm
-        if place is None or radius_mm == 0:
-            return
-        ball = trimesh.creation.icosphere(radius=radius_mm)
-        around = solid_of(translated(ball, np.array(place) - self.origin), "hilum")
-        volumes = [(solid_of(each, "organ") ^ around).volume() for each in (cut.specimen, self.whole_organ)]
-        if volumes[0] > MOST_OF_HILUM * volumes[1]:
-            raise ResectionError(
-                f"the cut removes {volumes[0] / volumes[1]:.0%} of the tissue around the hilum, where the kidney's vessels enter; set the "
-                "score nearer to the tumour"
-            )
 
     def apply_cut(self, cut: Cut | None) -> None:
         # Before anything changes: a part's surface may be one that cannot be cut.

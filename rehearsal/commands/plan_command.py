@@ -98,17 +98,17 @@ def plan(asked: PlanOptions) -> None:
 
 def plan_resection(asked: PlanOptions) -> None:
     """Propose technique and line of a resection, and write them. Raises CommandError, ResectionError."""
+    from rehearsal.resection.cut import hilum_of
     from rehearsal.resection.proposal import propose, why_first
     from rehearsal.resection.resection_page import draw_page, figures_of
     from rehearsal.resection.resection_plan import ResectionPlan, planned_cut, write_resection_plan
 
-    _, anatomy = load_patient(asked.scene, asked.changes, asked.quality)
+    scene, anatomy = load_patient(asked.scene, asked.changes, asked.quality)
     if anatomy.tumour is None:
         raise CommandError("--resect: this patient has no tumour; name its label when you import the patient")
     make_place(asked.out, "--out")
-    proposals = propose(
-        anatomy.organ, anatomy.tumour, anatomy.parts, asked.margin_mm, anatomy.labels, anatomy.tissues
-    )
+    about = anatomy.organ, anatomy.tumour, anatomy.parts, asked.margin_mm, anatomy.labels, anatomy.tissues
+    proposals = propose(*about, hilum_of(scene.attachment, np.zeros(3)))
     cuts = [planned_cut(proposal, np.zeros(3)) for proposal in proposals]
     write_resection_plan(
         ResectionPlan(version=VERSION, anatomy=fingerprint(anatomy), margin_mm=asked.margin_mm, cuts=cuts),

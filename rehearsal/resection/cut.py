@@ -23,7 +23,9 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from rehearsal.resection.score_line import ResectionError, ScoreLine, enclosed_by, places_on
 from render.viewer import Technique
+from scenes.scene import Attachment
 from scenes.solids import solid_of, surface_of
+from scenes.surfaces import translated
 from ultrasound.crater import Filling
 
 # Longest edge of the triangles of the resection surface; the hull is simplified by at most the second.
@@ -41,6 +43,8 @@ LEAST_STAYING_ML = 0.05
 LEAST_PIECE_MM3 = 1e-6
 # Less of a part is within the error of its surface [mm^3].
 LEAST_LEFT_MM3 = 1.0
+# Largest share of the tissue that the hilum's vessels hold that a cut may remove.
+MOST_OF_HILUM = 0.25
 # A wedge is at most so many times as deep as the tumour and the margin.
 STEEPEST = 3.0
 
@@ -100,6 +104,28 @@ def cut_organ(
     rest, of_rest = surface_of(remnant)
     capsule = whole.original_id()
     return Cut(line, settings, own, rest, of_own != capsule, of_rest != capsule, tuple(warnings))
+
+
+def hilum_of(attachment: Attachment, origin: np.ndarray) -> trimesh.Trimesh | None:
+    """The ball that a scene's attachment holds, relative to an origin (3,) [mm, LPS]; None where it holds nothing."""
+    if attachment.at_mm is None or attachment.radius_mm == 0:
+        return None
+    return translated(
+        trimesh.creation.icosphere(radius=attachment.radius_mm), np.array(attachment.at_mm) - origin
+    )
+
+
+def check_hilum(cut: Cut, organ: trimesh.Trimesh, hilum: trimesh.Trimesh | None) -> None:
+    """Raises ResectionError where the specimen would contain much of an organ's tissue around its hilum."""
+    if hilum is None:
+        return
+    around = solid_of(hilum, "hilum")
+    removed, whole = ((solid_of(each, "organ") ^ around).volume() for each in (cut.specimen, organ))
+    if removed > MOST_OF_HILUM * whole:
+        raise ResectionError(
+            f"the cut removes {removed / whole:.0%} of the tissue around the hilum, where the kidney's vessels enter; set the score "
+            "nearer to the tumour"
+        )
 
 
 def _pieces(solid: manifold3d.Manifold) -> list[manifold3d.Manifold]:

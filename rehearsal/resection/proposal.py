@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
 
-from rehearsal.resection.cut import Cut, CutSettings, cut_organ, grown
+from rehearsal.resection.cut import Cut, CutSettings, check_hilum, cut_organ, grown
 from rehearsal.resection.judgement import Carried, Judgement, judge
 from rehearsal.resection.score_line import ResectionError, ScoreLine, places_on, score_line
 from scenes.anatomy import Grid
@@ -136,10 +136,11 @@ def propose(
     margin_mm: float,
     labels: Grid | None = None,
     tissues: Mapping[int, str] | None = None,
+    hilum: trimesh.Trimesh | None = None,
 ) -> list[Proposal]:
     """Cuts of an organ at rest around its tumour with a margin [mm], the best first: at most one for each technique and direction.
 
-    Raises ResectionError where none can be made.
+    A cut that removes much of the tissue within ``hilum`` is none. Raises ResectionError where none can be made.
     """
     settings = [CutSettings("enucleoresection", margin_mm), CutSettings("wedge", margin_mm)]
     if margin_mm == 0:
@@ -151,6 +152,7 @@ def propose(
         for line in _lines(organ, tumour, margin_mm + beyond_mm):
             try:
                 cut = cut_organ(organ, line, each, np.asarray(tumour.vertices))
+                check_hilum(cut, organ, hilum)
             except ResectionError:
                 continue
             carried = replace(
@@ -160,7 +162,7 @@ def propose(
             found.append(Proposal(cut, judged))
     if not found:
         raise ResectionError(
-            f"no cut with a margin of {margin_mm:g} mm around this tumour leaves most of the kidney; choose a smaller margin"
+            f"no cut with a margin of {margin_mm:g} mm around this tumour leaves most of the kidney and of its hilum; choose a smaller margin"
         )
     return sorted(found, key=lambda proposal: proposal.cost_ml)
 

@@ -399,9 +399,12 @@ def test_it_is_cut_but_once_and_page_score_and_plan_are_written_and_compared(
     few = SimpleNamespace(vertices=trimesh.creation.icosahedron().vertices[::4])
     creation = SimpleNamespace(icosahedron=lambda: few)
     monkeypatch.setattr(proposal, "trimesh", SimpleNamespace(creation=creation))
-    proposals = propose(
-        anatomy.organ, anatomy.tumour, anatomy.parts, MARGIN_MM, anatomy.labels, anatomy.tissues
-    )
+    about = anatomy.organ, anatomy.tumour, anatomy.parts, MARGIN_MM, anatomy.labels, anatomy.tissues
+    proposals = propose(*about)
+    # What is refused when it is cut is not proposed.
+    monkeypatch.setattr(proposal, "_lines", lambda *_: [proposals[0].cut.line])
+    with pytest.raises(ResectionError, match="hilum"):
+        propose(*about, trimesh.creation.icosphere().apply_translation(anatomy.tumour.center_mass))
     costs = [each.cost_ml for each in proposals]
     assert len(costs) > 1 and costs == sorted(costs) and proposals[0].settings.technique == "enucleoresection"
     assert proposals[0].judgement.margin.margin_mm.min() > MARGIN_MM - 0.1
