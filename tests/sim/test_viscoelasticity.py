@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from lattice_tissue import put, settings_of
 from scipy.integrate import quad
+from test_neo_hookean import deformed, forces_of
 
 from sim.body import Body
 from sim.fields import array_of
@@ -93,6 +94,21 @@ def test_a_loaded_bar_creeps_as_the_standard_linear_solid(one_device, term):
     late = times > 0.5
     # Strains of 1 %: Hooke's law is off by that much.
     assert np.abs(np.array(found) - wanted)[late].max() < 0.03 * strain
+
+
+def test_fast_deformation_is_resisted_by_the_sum_of_all_stiffnesses(one_device):
+    """Force and Hessian without a history are those of elastic tissue times 1 + sum gamma (1 - exp(-x)) / x, x = dt / tau."""
+    lattice = fill_block(BAR, CELL)
+    found = []
+    for prony in ((), TERMS):
+        model = NeoHookean(Body(lattice.nodes), lattice, prony=prony, hourglass_stiffness=0.0)
+        found.append(forces_of(model, deformed(lattice.nodes)))
+    x = [DT / term.time_s for term in TERMS]
+    factor = 1 + sum(
+        term.modulus_ratio * (1 - np.exp(-each)) / each for term, each in zip(TERMS, x, strict=True)
+    )
+    for elastic, relaxing in zip(*found, strict=True):
+        assert relaxing == pytest.approx(factor * elastic, rel=1e-4, abs=1e-5 * np.abs(elastic).max())
 
 
 def test_the_history_belongs_to_the_state(one_device):
