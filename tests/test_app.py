@@ -210,7 +210,7 @@ def test_a_mistake_ends_the_program_with_one_line_and_status_2(tmp_path):
     assert done.returncode == 2 and done.stderr.startswith("nephron: ") and done.stderr.count("\n") == 1
 
 
-def test_mistakes_are_one_line(tmp_path):
+def test_mistakes_are_one_line(tmp_path, monkeypatch):
     assert "no such scene file" in refused("rehearse", tmp_path / "none.toml")
     assert "Did you mean one of: '--headless'" in refused("rehearse", "--hedless")
     assert "No such command 'rehears'. Did you mean 'rehearse'?" in refused("rehears")
@@ -218,6 +218,8 @@ def test_mistakes_are_one_line(tmp_path):
     assert "leave out --no-pictures or --link" in refused("rehearse", "--headless", "--no-pictures", "--link")
     with pytest.raises(CommandError, match="add --headless"):
         RehearseOptions(no_pictures=True).check()
+    monkeypatch.setattr("rehearsal.commands.rehearse_command.display_available", lambda: True)
+    assert "a window stays open" in refused("rehearse", "--seconds", "5")
     assert "--arch" in refused("rehearse", "--arch", "abacus")
     assert "--seconds" in refused("rehearse", "--seconds", "-1")
     assert "--radius = 0.0" in refused("rehearse", "--radius", "0")

@@ -42,6 +42,10 @@ FORMER_KEYS = {"PulseCycles": "BandwidthPercent", "FocalZoneMm": "FNumber"}
 
 Percent = Annotated[float, Field(ge=0, le=100)]
 Length = Annotated[float, Field(gt=0)]
+# TOML has lists where Python has tuples.
+Lengths = Annotated[tuple[Length, Length, Length], Field(strict=False)]
+Range = Annotated[tuple[float, float], Field(strict=False)]
+Sliders = Annotated[tuple[Percent, ...], Field(strict=False, min_length=TGC_SLIDERS, max_length=TGC_SLIDERS)]
 
 
 class ProbeError(UserError):
@@ -63,12 +67,17 @@ class Probe(BaseModel):
     """
 
     model_config = ConfigDict(
-        extra="forbid", frozen=True, allow_inf_nan=False, alias_generator=to_pascal, populate_by_name=True
+        extra="forbid",
+        frozen=True,
+        allow_inf_nan=False,
+        strict=True,
+        alias_generator=to_pascal,
+        populate_by_name=True,
     )
 
     transducer_name: str = Field(min_length=1, max_length=60)
     transducer_geometry: Literal["LINEAR", "CURVILINEAR", "PHASED"] = "LINEAR"
-    housing_mm: tuple[Length, Length, Length] = (40.0, 10.0, 20.0)
+    housing_mm: Lengths = (40.0, 10.0, 20.0)
     edge_radius_mm: float = Field(0.0, ge=0, le=20)
     transducer_width_mm: float = Field(40.0, gt=0, le=300)
     radius_start_mm: float = Field(0.0, ge=0, le=300)
@@ -76,7 +85,7 @@ class Probe(BaseModel):
     theta_stop_deg: float = Field(0.0, ge=0, le=80)
     number_of_scanlines: int = Field(192, ge=32, le=1024)
     number_of_samples_per_scanline: int = Field(640, ge=32, le=4096, multiple_of=16)
-    frequency_range_mhz: tuple[float, float] = (2.0, 15.0)
+    frequency_range_mhz: Range = (2.0, 15.0)
     frequency_mhz: float = Field(7.5, ge=1, le=40)
     depth_mm: float = Field(60.0, ge=5, le=300)
     focus_depth_percent: Percent = 40.0
@@ -98,9 +107,7 @@ class Probe(BaseModel):
     wall_filter_cm_s: float = Field(1.5, ge=0.2, le=20)
     colour_gain_percent: Percent = 50.0
     colour_steering_deg: float = Field(0.0, ge=-30, le=30)
-    time_gain_compensation: tuple[Percent, ...] = Field(
-        (50.0,) * TGC_SLIDERS, min_length=TGC_SLIDERS, max_length=TGC_SLIDERS
-    )
+    time_gain_compensation: Sliders = (50.0,) * TGC_SLIDERS
     depth_compensation_db_cm_mhz: float = Field(0.95, ge=0, le=5)
 
     @model_validator(mode="after")

@@ -4,7 +4,7 @@ import os
 
 import click
 
-from rehearsal.commands.command_line import command
+from rehearsal.commands.command_line import CommandError, command
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.real_time.started_process import started_process
 from render.display import display_available
@@ -20,6 +20,10 @@ def rehearse(asked: RehearseOptions) -> None:
     if not asked.headless and not display_available():
         click.echo(f"No display ({why_no_display()}): running the scripted press without a window.")
         asked.headless = True
+    if asked.seconds is not None and not asked.headless:
+        raise CommandError(
+            "--seconds: a window stays open until it is closed; leave it out, or add --headless"
+        )
     with started_process(not asked.headless) as process:
         from rehearsal.opening import opened
 

@@ -97,7 +97,7 @@ class Judgement:
         found = []
         if self.margin.positive_mm2 > 0:
             found.append(
-                f"the cut goes through the tumour over {self.margin.positive_mm2:.0f} mm2; {self.tumour_left_ml:.1f} ml of it are left"
+                f"the cut goes through the tumour over {shown(self.margin.positive_mm2, 'mm2')}; {shown(self.tumour_left_ml, 'ml', 1)} of it left"
             )
         wide = [vessel for vessel in self.vessels or () if vessel.diameter_mm >= MAIN_VESSEL_MM]
         if wide:
@@ -257,12 +257,18 @@ def _vessel_at(points: np.ndarray, labels: Grid | None, tissues: Mapping[int, st
     return max(counts, key=counts.__getitem__) if any(counts.values()) else "vessel"
 
 
+def shown(value: float, unit: str, digits: int = 0) -> str:
+    """A figure as it is written: what is too small for the last digit is not written as zero."""
+    least = 10.0**-digits
+    return f"< {least:g} {unit}" if 0 < value < least else f"{value:.{digits}f} {unit}"
+
+
 def findings_of(judgement: Judgement) -> dict[str, str]:
     """Name -> figure with its unit, of a cut, for the window."""
     margin, opened = judgement.margin, judgement.collecting_system_opened_mm2
     found = {
         "least margin": f"{margin.least_mm:.1f} mm",
-        "positive margin": f"{margin.positive_mm2:.0f} mm2",
+        "positive margin": shown(margin.positive_mm2, "mm2"),
         "specimen": f"{judgement.specimen_ml:.1f} ml",
         "parenchyma": f"-{judgement.parenchyma_removed_ml:.1f} ml ({judgement.parenchyma_removed_percent:.1f} %)",
         "calyces opened": NOT_LABELLED if opened is None else f"{opened:.0f} mm2",

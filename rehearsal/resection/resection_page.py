@@ -15,7 +15,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.cut import Cut
-from rehearsal.resection.judgement import MARGIN_LIMITS_MM, NOT_LABELLED, Judgement
+from rehearsal.resection.judgement import MARGIN_LIMITS_MM, NOT_LABELLED, Judgement, shown
 from rehearsal.resection.operation import distance_to_tumour, seen_share
 from rehearsal.resection.proposal import KEPT_WITHIN_MM
 from rehearsal.resection.resection_plan import ResectionPlan
@@ -211,7 +211,7 @@ def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
     seen = report["tumour_seen_percent"]
     opened, divided = report["collecting_system_opened_mm2"], report["vessels"]
     vessels = [f"{each['tissue']} {each['diameter_mm']:.1f} mm" for each in divided or []]
-    shown = ", ".join(vessels[:3]) + (f" and {len(vessels) - 3} more" if len(vessels) > 3 else "")
+    cut_vessels = ", ".join(vessels[:3]) + (f" and {len(vessels) - 3} more" if len(vessels) > 3 else "")
     below = ", ".join(f"{report[f'margin_below_{limit:g}_mm2']:.0f}" for limit in MARGIN_LIMITS_MM)
     limits = ", ".join(f"{limit:g}" for limit in MARGIN_LIMITS_MM)
     plan, warnings = report.get("against_plan"), len(report.get("import_warnings", []))
@@ -240,7 +240,7 @@ def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
         (f"area below {limits} mm", f"{below} mm2"),
         (
             "positive margin",
-            f"{report['positive_margin_mm2']:.0f} mm2; tumour left {report['tumour_left_ml']:.2f} ml",
+            f"{shown(report['positive_margin_mm2'], 'mm2')}; tumour left {shown(report['tumour_left_ml'], 'ml', 2)}",
         ),
         ("specimen", f"{report['specimen_ml']:.1f} ml"),
         (
@@ -248,7 +248,7 @@ def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
             f"{report['parenchyma_removed_ml']:.1f} ml, {report['parenchyma_removed_percent']:.1f} % of the kidney",
         ),
         ("collecting system", NOT_LABELLED if opened is None else f"{opened:.0f} mm2 opened"),
-        ("vessels cut", NOT_LABELLED if divided is None else shown or "none"),
+        ("vessels cut", NOT_LABELLED if divided is None else cut_vessels or "none"),
         ("bed", f"{report['bed_mm2'] / 100:.1f} cm2"),
         *against,
         *([("import", f"{counted(warnings, 'warning')} not acknowledged")] if warnings else []),

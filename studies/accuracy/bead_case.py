@@ -15,7 +15,7 @@ import trimesh
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from errors import PatientError, UserError, explained
-from scenes.section import Direction, Vector3
+from scenes.section import LIST, Direction, Length, Vector3
 from scenes.surfaces import load_surface
 from sim.attachment import FixedRegion
 from sim.material import Material, Part
@@ -40,13 +40,13 @@ def _proper(rows: tuple[Vector3, Vector3, Vector3]) -> tuple[Vector3, Vector3, V
     return rows
 
 
-Rotation = Annotated[tuple[Vector3, Vector3, Vector3], AfterValidator(_proper)]
+Rotation = Annotated[tuple[Vector3, Vector3, Vector3], LIST, AfterValidator(_proper)]
 
 
 class CaseSection(BaseModel):
-    """A table of case.toml. Other keys are ignored, unless they are a known key in another unit."""
+    """A table of case.toml. Other keys are ignored, unless they are a known key in another unit. A text is no number."""
 
-    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False, strict=True)
 
     @model_validator(mode="after")
     def _own_units(self) -> "CaseSection":
@@ -86,7 +86,7 @@ class CaseMaterial(CaseSection):
     young_kPa: float | None = Field(None, gt=0, le=1e6)
     poisson: float | None = Field(None, ge=0, lt=0.5)
     density: float | None = Field(None, ge=100, le=20000)
-    part: tuple[CasePart, ...] = ()
+    part: Annotated[tuple[CasePart, ...], LIST] = ()
 
 
 class CaseContact(CaseSection):
@@ -107,7 +107,7 @@ class CaseProbe(CaseSection):
     """A cuboid, full lengths along its own axes, edges rounded inside them; columns of ``rotation`` are these axes."""
 
     shape: Literal["cuboid"]
-    size_mm: tuple[Annotated[float, Field(gt=0, le=500)], ...] = Field(min_length=3, max_length=3)
+    size_mm: tuple[Length, ...] = Field(min_length=3, max_length=3, strict=False)
     edge_radius_mm: float = Field(0.0, ge=0)
     press_direction: Direction
     rotation: Rotation
@@ -154,8 +154,8 @@ class CaseFile(CaseSection):
     contact: CaseContact = CaseContact()
     files: Files = Files()
     probe: CaseProbe
-    hold: tuple[CaseHold, ...] = ()
-    stage: tuple[CaseStage, ...] = Field(min_length=2)
+    hold: Annotated[tuple[CaseHold, ...], LIST] = ()
+    stage: tuple[CaseStage, ...] = Field(min_length=2, strict=False)
 
     @model_validator(mode="after")
     def _in_order(self) -> "CaseFile":

@@ -16,6 +16,7 @@ from rehearsal.resection.judgement import (
     divided_vessels,
     findings_of,
     judge,
+    shown,
 )
 from rehearsal.resection.proposal import cost_ml
 from scenes.anatomy import Grid
@@ -180,3 +181,10 @@ def test_a_vessel_that_the_cut_only_grazes_is_none():
     assert divided_vessels(fine, grazing, None, {}) == ()
     assert len(divided_vessels(fine, ball(5.0, (0.0, 0.0, 3.0)), None, {})) == 1
     assert divided_vessels(fine, None, None, {}) is None, "not labelled"
+
+
+@pytest.mark.parametrize(
+    "value, digits, text", [(0.0, 0, "0 ml"), (0.2, 0, "< 1 ml"), (1.4, 0, "1 ml"), (0.004, 2, "< 0.01 ml")]
+)
+def test_a_trace_is_not_written_as_zero(value, digits, text):
+    assert shown(value, "ml", digits) == text

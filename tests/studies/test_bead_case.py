@@ -77,6 +77,7 @@ def test_the_digest_differs_with_the_contents(tmp_path):
         ("gravity.direction", [0, 0, 0], "a direction must not be zero"),
         ("contact.friction_on_probe", False, "contact.friction_on_probe = False: input should be True"),
         ("probe.shape", "sphere", "probe.shape = 'sphere': input should be 'cuboid'"),
+        ("material.young_kPa", "15", "material.young_kPa = '15': input should be a valid number"),
         ("probe.size_mm", [40.0, 10.0], "probe.size_mm = [40.0, 10.0]: tuple should have at least 3 items"),
         ("probe.edge_radius_mm", 4.5, "edge_radius_mm is 4.5: expected at most half"),
         ("probe.rotation", [[2, 0, 0], [0, 1, 0], [0, 0, 1]], "expected a rotation matrix"),

@@ -69,6 +69,7 @@ WRONG = {
         r"PulseCycles no longer exists; delete it \(BandwidthPercent sets the same\)",
     ),
     "a wrong type": (GOOD + 'DepthMm = "deep"\n', "DepthMm = 'deep': input should be a valid number"),
+    "a number in quotes": (GOOD + 'DepthMm = "60"\n', "DepthMm = '60': input should be a valid number"),
     "a missing name": ("DepthMm = 60.0\n", "TransducerName: missing"),
     "an array wider than its housing": (
         GOOD + "TransducerWidthMm = 50\n",
