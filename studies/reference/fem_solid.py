@@ -13,6 +13,8 @@ from skfem.assembly.basis import AbstractBasis
 from skfem.mapping import MappingIsoparametric
 
 INVERSION_STEPS, INVERTED_MM = 12, 1e-9
+# Order of the polynomials that the points of a boundary face integrate.
+SURFACE_ORDER = 6
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ class FemSolid:
         self.volume_share = np.bincount(self.basis.element_dofs.ravel(), share)
         gradients = np.stack([function[0].grad for function in self.basis.basis])
         self._gradient = _operator(self.basis, gradients.transpose(0, 2, 3, 1))
-        surface = FacetBasis(mesh, ElementTetP2(), mapping, intorder=6)
+        surface = FacetBasis(mesh, ElementTetP2(), mapping, intorder=SURFACE_ORDER)
         self.at_surface, self.areas = _operator(surface, _values(surface)), surface.dx.ravel()
         if not np.isfinite(self.at_surface.data).all():
             raise MeshError("a curved tetrahedron at the surface is nearly folded over")

@@ -10,10 +10,11 @@ import igl
 import numpy as np
 import trimesh
 from mmgpy import MmgMesh3D
-from skfem import Basis, ElementTetP2, MeshTet, MeshTet2
+from skfem import Basis, ElementTetP2, FacetBasis, MeshTet, MeshTet2
+from skfem.assembly import Dofs
 
 from scenes.surfaces import signed_distance_from
-from studies.reference.fem_solid import CurvedMapping, MeshError
+from studies.reference.fem_solid import SURFACE_ORDER, CurvedMapping, MeshError
 
 GRID_MM = 3.0
 CHORD_OF_SIZE = 0.05
@@ -87,14 +88,14 @@ def _curved(straight: MeshTet, surface: trimesh.Trimesh) -> MeshTet2:
         np.ascontiguousarray(surface.vertices, float),
         np.ascontiguousarray(surface.faces, np.int64),
     )[2].T
-    return _unfolded(MeshTet2(places, mesh.t))
+    return unfolded(MeshTet2(places, mesh.t))
 
 
-def _unfolded(mesh: MeshTet2) -> MeshTet2:
+def unfolded(mesh: MeshTet2) -> MeshTet2:
     """The mesh with straight edges where tetrahedra would fold over, or nearly: at a sharp edge of the surface."""
     while len(folded := _folded(mesh)):
         straight = MeshTet2.from_mesh(MeshTet(mesh.doflocs[:, : mesh.t.max() + 1], mesh.t))
-        middles = Basis(mesh, ElementTetP2(), intorder=1).element_dofs[4:, folded]
+        middles = Dofs(mesh, ElementTetP2()).element_dofs[4:, folded]
         places = mesh.doflocs.copy()
         places[:, middles] = straight.doflocs[:, middles]
         if np.array_equal(places, mesh.doflocs):
@@ -104,7 +105,16 @@ def _unfolded(mesh: MeshTet2) -> MeshTet2:
 
 
 def _folded(mesh: MeshTet2) -> np.ndarray:
-    """The curved tetrahedra (n,) whose volume ratio to straight ones changes its sign among their nodes, or almost vanishes."""
-    scale = CurvedMapping(mesh, ElementTetP2(), mesh.bndelem).detDF(ElementTetP2().doflocs.T)
+    """The curved tetrahedra (n,) whose volume ratio to straight ones changes its sign among their nodes, or almost vanishes.
+
+    Also those in which Newton's method does not find a point of their face at the boundary.
+    """
+    mapping = CurvedMapping(mesh, ElementTetP2(), mesh.bndelem)
+    # scikit-fem's own determinant raises an error where it vanishes.
+    scale = np.linalg.det(np.moveaxis(mapping.DF(ElementTetP2().doflocs.T), (0, 1), (2, 3)))
     least, most = np.sort(np.abs(scale), axis=1)[:, [0, -1]].T
-    return np.flatnonzero((scale.min(axis=1) * scale.max(axis=1) <= 0) | (least < LEAST_SCALE * most))
+    squeezed = np.flatnonzero((scale.min(axis=1) * scale.max(axis=1) <= 0) | (least < LEAST_SCALE * most))
+    if len(squeezed):
+        return squeezed
+    faces = FacetBasis(mesh, ElementTetP2(), mapping, intorder=SURFACE_ORDER)
+    return np.unique(faces.tind[~np.isfinite(np.asarray(faces.basis[0][0])).all(axis=1)])

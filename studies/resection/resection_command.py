@@ -108,8 +108,16 @@ def _balance() -> Part:
         raise CommandError(
             f"the balance needs {error.name}, which is not installed: pip install -r requirements-dev.txt, or leave --part balance out"
         ) from None
+    from studies.reference.equilibrium import NotConvergedError
+    from studies.reference.fem_solid import MeshError
+
     start("cpu")
-    rows, to_coarser = balance_rows()
+    try:
+        rows, to_coarser = balance_rows()
+    except (MeshError, NotConvergedError) as error:
+        raise CommandError(
+            f"no finite elements of the cut kidney: {error}; leave --part balance out"
+        ) from None
     setup = rows[0].setup
     apart = " / ".join(f"{value:.2f}" for value in to_coarser.mean(axis=1))
     text = (

@@ -14,12 +14,12 @@ import app
 from studies.accuracy.bead_case import load_case
 from studies.reference.equilibrium import Equilibrium, NotConvergedError
 from studies.reference.fem_press import FemExperiment, FemPress
-from studies.reference.fem_solid import FemMaterial, FemSolid
+from studies.reference.fem_solid import FemMaterial, FemSolid, MeshError
 from studies.reference.make_reference import blue_noise, in_case_frame
 from studies.reference.penalty_contact import Law, PenaltyContact
 from studies.reference.reference_case import ReferenceCase
 from studies.reference.smooth_obstacles import DistanceField, RoundedBox
-from studies.reference.tetrahedral_mesh import tetrahedra
+from studies.reference.tetrahedral_mesh import tetrahedra, unfolded
 
 SIDE_MM = 10.0
 TISSUE = FemMaterial()
@@ -58,6 +58,19 @@ def on_faces(solid: FemSolid) -> np.ndarray:
 def held(solid: FemSolid, fixed: np.ndarray, contacts: list[PenaltyContact] | None = None) -> Equilibrium:
     """A weightless solid of which some displacements, shape (nodes, 3) bool, are given."""
     return Equilibrium(solid, contacts or [], np.zeros_like(solid.rest), fixed)
+
+
+def test_edges_become_straight_where_points_of_a_curved_face_are_not_found():
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]).T
+    straight = MeshTet2.from_mesh(MeshTet(corners, np.arange(4)[:, None]))
+    places = straight.doflocs.copy()
+    # Its volume ratio is 0.5 to 3.3 at the nodes: not folded there.
+    places[:, 4:] += np.random.default_rng(55).normal(0, 0.12, (3, 6))
+    curved = MeshTet2(places, straight.t)
+    with pytest.raises(MeshError, match="nearly folded"):
+        FemSolid(curved, TISSUE)
+    assert FemSolid(unfolded(curved), TISSUE).volume_share.sum() == pytest.approx(1 / 6)
+    assert np.array_equal(unfolded(straight).doflocs, straight.doflocs)
 
 
 def test_an_affine_deformation_passes_the_patch_test():
