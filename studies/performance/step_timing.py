@@ -44,6 +44,7 @@ UP = np.array([0.0, 0.0, 1.0])
 # A block takes at most this share of the free memory.
 MOST_MEMORY = 0.6
 RADII_MM = (2.2, 2.5, 2.7, 3.0, 3.3)
+PIECES_STEPS = 9
 COUNTS = [1_000, 4_000, 16_000, 64_000, 250_000, 1_000_000]
 QUICK_COUNTS = [1_000, 4_000, 16_000]
 # The particle radius of the paper's figures, which is compared with other programs.
@@ -281,11 +282,13 @@ def figure_of(presses: list[TimedPress], sizes: list[dict]) -> Figure:
 def _over_time(axes: Axes, press: TimedPress) -> None:
     """The paper's Figure 7."""
     case = press.case
-    contacts = [sum(ms.get(name, 0.0) for name in CONTACTS) for ms in press.pieces_ms]
+    contacts = pd.Series([sum(ms.get(name, 0.0) for name in CONTACTS) for ms in press.pieces_ms])
+    # What interrupts one piece of a step is taken off all of them.
+    contacts = contacts.rolling(PIECES_STEPS, center=True, min_periods=1).median()
     elapsed_s = case["time_step_s"] * np.arange(1, len(press.step_ms) + 1)
     warm_up_s = case["time_step_s"] * press.warm_up_steps
     axes.plot(elapsed_s, press.step_ms, linewidth=0.8, label="whole step")
-    axes.plot(elapsed_s, contacts, linewidth=0.8, label="contacts")
+    axes.plot(elapsed_s, contacts, linewidth=0.8, label=f"contacts, median of {PIECES_STEPS} steps")
     axes.axvline(warm_up_s, color="0.5", linestyle="--", linewidth=0.8)
     axes.annotate(" press", (warm_up_s, 0), color="0.4", va="bottom")
     axes.set_ylim(0, 1.5 * sorted(press.step_ms)[int(0.98 * len(press.step_ms))])
