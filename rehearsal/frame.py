@@ -42,6 +42,7 @@ from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane
 from ultrasound.scanner import B_MODE, IMAGES_OF_MODE
 
+PREPARING = "PREPARING THE IMAGE"
 # How long a notice stays on the screen, and the one that the tissue's state was restored.
 NOTICE_S, RESTORED_S = 2.0, 4.0
 # The simulation counts as real time from this share of it on.
@@ -157,6 +158,7 @@ class WindowFrames(Frames[WindowInput]):
     _notice_until: float = field(default=0.0, init=False)
     _restored_until: float = field(default=0.0, init=False)
     _shown_cut: Cut | None = field(default=None, init=False)
+    _kinds: set[tuple[str | bool, ...]] = field(default_factory=set, init=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -173,6 +175,7 @@ class WindowFrames(Frames[WindowInput]):
             if view is not None:
                 with self.times.stage("last state"):
                     self._use_waiting_time(view)
+            self._announce_new_kind(view, controls.settings)
             view = self.next_view(controls)
             self._draw(view, controls)
             if controls.export:
@@ -202,6 +205,14 @@ class WindowFrames(Frames[WindowInput]):
                 self.observe_window(probe)
             self._record_sweep(probe, view, controls)
             return self.present(view, probe, controls)
+
+    def _announce_new_kind(self, view: View | None, settings: ScannerSettings) -> None:
+        """Say over the last image that one of a new kind is prepared: compiling its kernels may take seconds."""
+        steered = settings.colour_steering_deg != 0
+        kind = settings.mode, settings.detail_level, settings.compounding, settings.doppler, steered
+        if view is not None and kind not in self._kinds:
+            self.viewer.draw(replace(view, status=PREPARING))
+        self._kinds.add(kind)
 
     def _use_waiting_time(self, view: View) -> None:
         """While the solver makes the next step, measure the last state and draw it in 3D, unless it has been changed since its image."""

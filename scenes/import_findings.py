@@ -49,6 +49,8 @@ class ImportFindings(Section):
     """How the patient lay in the CT."""
     extent_mm: Vector3
     """Of the organ: right-left, front-back, foot-head."""
+    length_mm: float | None = None
+    """From pole to pole, without tumours and cysts; None in files that were written without it."""
     surfaces: dict[str, SurfaceFindings]
     """Of the organ, its parts by tissue, and the support."""
     series: str

@@ -17,8 +17,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from scipy.spatial.distance import pdist
 from skimage.color import rgb2lab
 
-from scenes.kidney_axes import kidney_axes
-from scenes.patients.organ_selection import HILAR, LESIONS
+from scenes.patients.organ_selection import HILAR
 from scenes.patients.part_surfaces import PARTS, PEDICLE_MM
 from scenes.patients.patient_import import Patient
 from scenes.patients.patient_position import LYING
@@ -95,9 +94,7 @@ def summary_rows(patient: Patient, complexity: Complexity | None = None) -> list
     rows += [("WARNING", line) for line in patient.warnings]
     rows.append(("organ", f"{patient.side} kidney, {volumes['organ']:.1f} ml (surface {surface_ml:.1f})"))
     rows.append(("extent", f"{extent} mm (right-left x front-back x foot-head)"))
-    lesions = [surface for tissue, surface in patient.parts.items() if tissue in LESIONS]
-    length_mm = kidney_axes(patient.organ, lesions, {}).length_mm
-    rows.append(("length", f"{length_mm:.0f} mm from pole to pole, without tumours and cysts"))
+    rows.append(("length", f"{patient.length_mm:.0f} mm from pole to pole, without tumours and cysts"))
     rows.append(("surface", f"{len(patient.organ.faces)} faces, watertight"))
     for tissue, name in PARTS.items():
         word = name.replace("-system", "")

@@ -18,6 +18,7 @@ def findings_of(patient: Patient, complexity: Complexity | None) -> ImportFindin
         draft=patient.draft,
         position=patient.position,
         extent_mm=_rounded(patient.organ.extents),
+        length_mm=round(patient.length_mm, DIGITS),
         surfaces={
             name: SurfaceFindings(
                 faces=len(surface.faces),

@@ -37,7 +37,7 @@ COMMON = (
     "left right kidney cyst vessels collecting system STL LPS ITK NRRD complete type int short unsigned char gzip space mm ml HU CT "
     "file format specification at http teem sourceforge net html dimension posterior superior sizes directions kinds domain endian little "
     "encoding origin version side draft supine prone decubitus position extent surfaces faces volume label labels support series source "
-    "size spacing direction tissues warnings notes text acknowledged true false null none complexity tumours diameter exophytic share "
+    "length size spacing direction tissues warnings notes text acknowledged true false null none complexity tumours diameter exophytic share "
     "contact distance touches main vessel renal padua estimated not known needed least most suffix low moderate high to components points "
     "measure unit location rim sinus artery and vein cm mesh kind "
 )

@@ -13,6 +13,7 @@ import SimpleITK as sitk
 import trimesh
 
 from errors import PatientError
+from scenes.kidney_axes import kidney_axes
 from scenes.patients.import_warnings import fat_warnings, label_warnings, orientation_warnings, stone_warnings
 from scenes.patients.kidney_plausibility import kidney_warnings
 from scenes.patients.label_shift import shift_warnings
@@ -74,6 +75,12 @@ class Patient:
     @property
     def tumour(self) -> trimesh.Trimesh | None:
         return self.parts.get("tumour")
+
+    @property
+    def length_mm(self) -> float:
+        """From pole to pole, without tumours and cysts."""
+        lesions = [surface for tissue, surface in self.parts.items() if tissue in LESIONS]
+        return kidney_axes(self.organ, lesions, {}).length_mm
 
 
 def import_patient(

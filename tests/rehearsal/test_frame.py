@@ -17,7 +17,7 @@ import app
 from rehearsal import frame, headless, opening, run
 from rehearsal.asked_files import AskedFiles
 from rehearsal.commands.rehearse_options import RehearseOptions
-from rehearsal.frame import Frames, WindowFrames
+from rehearsal.frame import PREPARING, Frames, WindowFrames
 from rehearsal.notices import Notices
 from rehearsal.pressed_organ import Step
 from rehearsal.resection.resection_state import NO_RESECTION
@@ -178,6 +178,22 @@ def test_a_state_is_measured_once_while_the_next_step_is_made_unless_it_has_chan
         ["input", "measure", "3D", "state", "image", "draw"],
         ["measure", "undo", "3D", "state", "image", "measure", "draw"],
         ["input", "3D", "state", "image", "draw", "measure"],
+    ]
+
+
+def test_the_first_image_of_a_new_kind_is_announced_over_the_last_one(looping):
+    plain, flow = Settings(), Settings(doppler="colour")
+    shown = []
+    looping.viewer = NullViewer(script=[Controls(each) for each in (plain, plain, flow, flow, plain)])
+    looping.viewer.draw = lambda view: (
+        shown.append((int(view.images["CT"][0, 0]), view.status == PREPARING)),
+        looping.viewer.close() if len(shown) == 6 else None,
+    )
+    looping.run()
+    first = shown[0][0]
+    assert shown == [
+        (first - n, announced)
+        for n, announced in [(0, False), (1, False), (1, True), (2, False), (3, False), (4, False)]
     ]
 
 

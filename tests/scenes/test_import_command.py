@@ -115,6 +115,7 @@ def test_the_findings_are_kept(written, taken_in):
     np.testing.assert_allclose(found.source.origin_mm, ORIGIN, atol=1e-3)
     assert found.surfaces["organ"].label_ml == pytest.approx(patient.volumes_ml["organ"], abs=1e-3)
     assert found.surfaces["tumour"].volume_ml == pytest.approx(patient.tumour.volume / 1000, abs=1e-3)
+    assert found.length_mm == pytest.approx(2 * LEFT[1][2], abs=3.5)
     assert found.complexity["tumours"] == 1
     assert list(found.open_warnings) == list(patient.warnings) and found.notes == patient.notes
 
