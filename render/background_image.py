@@ -336,19 +336,35 @@ def ends_of(axes: np.ndarray) -> list[tuple[str, np.ndarray]]:
     return [(letter, end[:2]) for letter, end in sorted(ends, key=lambda end: -end[1][2])]
 
 
+def are_apart(places: np.ndarray, least: float) -> list[bool]:
+    """Whether each of some places (n, 2), the nearest last, is at least so far from all nearer ones for which that is true."""
+    free: list[np.ndarray] = []
+    apart = []
+    for place in places[::-1]:
+        apart.append(all(np.linalg.norm(place - other) >= least for other in free))
+        free += [place] * apart[-1]
+    return apart[::-1]
+
+
 def compass_image(layout: WindowLayout, axes: np.ndarray) -> np.ndarray:
-    """Return the compass for a camera's axes (3, 3), uint8, shape of layout.compass."""
+    """Return the compass for a camera's axes (3, 3), uint8, shape of layout.compass.
+
+    Of two letters at the same place the nearer one is shown: at the opposite place it is the other axis's.
+    """
     size = layout.compass.width
     image = Image.new("RGB", (size, size), FINDINGS)
     draw = ImageDraw.Draw(image)
     draw.rectangle([0, 0, size - 1, size - 1], outline=LINE)
     middle = np.array([size, size]) / 2
     ends = ends_of(axes)
-    for place, (letter, axis) in enumerate(ends):
-        near = place >= len(ends) / 2
-        colour, down = TEXT if near else QUIET, axis * [1, -1]
-        tip = middle + size * ARM * down
-        end = tip + size * BEYOND * down / np.linalg.norm(down)
-        draw.line([*middle, *tip], fill=colour, width=layout.px(LINE_PX))
-        draw.text(tuple(end), letter, font=font(layout.px(LETTER_PX)), fill=colour, anchor="mm")
+    down = np.array([axis for _, axis in ends]) * [1, -1]
+    tips = middle + size * ARM * down
+    places = tips + size * BEYOND * down / np.linalg.norm(down, axis=1, keepdims=True)
+    for rank, shows_letter in enumerate(are_apart(places, layout.px(LETTER_PX))):
+        colour = TEXT if rank >= len(ends) / 2 else QUIET
+        draw.line([*middle, *tips[rank]], fill=colour, width=layout.px(LINE_PX))
+        if shows_letter:
+            draw.text(
+                tuple(places[rank]), ends[rank][0], font=font(layout.px(LETTER_PX)), fill=colour, anchor="mm"
+            )
     return np.asarray(image)

@@ -8,6 +8,7 @@ import pytest
 from render.background_image import (
     ARM,
     BackgroundImage,
+    are_apart,
     backdrop,
     clock_box,
     compass_image,
@@ -381,6 +382,21 @@ def test_what_points_up_in_the_compass_is_drawn_up():
     away = round(0.5 * ARM * size)
     column = picture[:, size // 2].astype(int)
     assert (column[size // 2 - away] == TEXT).all() and (column[size // 2 + away] == QUIET).all()
+
+
+def test_of_two_letters_at_one_place_the_nearer_is_shown():
+    near = [(5.0, 0.0), (0.0, 0.0), (9.0, 0.0), (10.0, 0.0)]
+    # The second is far from what is shown, the first is not hidden by it, and the third is hidden by the last.
+    assert are_apart(np.array(near), 5.0) == [True, True, False, True]
+    assert are_apart(np.array(near), 5.5) == [False, True, False, True]
+    # Seen along a diagonal of left and back: two letters of the four stay, the nearer one on each side.
+    turn = np.pi / 4
+    right, ahead = [np.cos(turn), np.sin(turn), 0.0], [-np.sin(turn), np.cos(turn), 0.0]
+    axes = np.array([right, [0.0, 0.0, 1.0], ahead])
+    ends = ends_of(axes)
+    ways = np.array([way for _, way in ends])
+    shown = {letter for (letter, _), is_shown in zip(ends, are_apart(ways, 0.1), strict=True) if is_shown}
+    assert shown == {"L", "A", "S", "I"}
 
 
 def test_the_compass_is_drawn_anew_when_the_camera_turns():
