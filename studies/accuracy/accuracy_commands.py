@@ -146,7 +146,7 @@ def _fit_material(asked: CalibrateOptions) -> None:
         fit = material_fit.fitted(loaded, setup, workers, bar.update)
     figures = fit.report()
     save_figures(figures, asked.out / "material.json")
-    click.echo(f"\n{material_fit.table(figures)}\n\nWrote material.json to {asked.out}")
+    click.echo(f"\n{material_fit.table(figures)}")
 
 
 def _fit_shape_matching(asked: CalibrateOptions) -> None:
