@@ -26,7 +26,7 @@ from rehearsal.tracking.pose_file import TimedPoses
 from rehearsal.tracking.track_file import check_near, load_track
 from render.keys import Keys, load_keys
 from scenes.anatomy import LoadedAnatomy, fingerprint
-from scenes.import_findings import open_warnings
+from scenes.import_findings import acknowledged_warnings, open_warnings
 from scenes.scene import Scene, load_scene, scene_file, with_options
 from ultrasound.probe import Probe, ProbeError, probe_of_values
 
@@ -49,6 +49,8 @@ class AskedFiles:
     bands: UncertaintyBands | None = None
     warnings: tuple[str, ...] = ()
     """Of the patient's import, which nobody has acknowledged."""
+    acknowledged: tuple[str, ...] = ()
+    """Warnings of the import which the user has acknowledged."""
 
 
 def read_files(asked: RehearseOptions) -> AskedFiles:
@@ -64,15 +66,15 @@ def read_files(asked: RehearseOptions) -> AskedFiles:
         if asked.headless and not (asked.track or asked.replay):
             raise CommandError(
                 f"--plan: {asked.plan} is a plan of a resection, and the scripted press cuts nothing; open it in a window, or add poses "
-                "with a cut (--track) or a session (--replay), which is then compared with it"
+                "with a cut (--track, such as docs/resection.json on the embedded patient) or a session (--replay), which is then compared with it"
             )
     elif asked.plan is not None:
         plan = read_plan(asked.plan)
     log = session_of(asked.replay, asked.at) if asked.replay else None
     changed, probe = as_asked(scene, asked) if log is None else as_recorded(log, scene)
     bands = None if scene.uncertainty is None else read_bands(path.parent / scene.uncertainty)
-    warnings = open_warnings(scene, path.parent)
-    return AskedFiles(path.parent, changed, probe, keys, track, plan, resection_plan, log, bands, warnings)
+    of_import = [find(scene, path.parent) for find in (open_warnings, acknowledged_warnings)]
+    return AskedFiles(path.parent, changed, probe, keys, track, plan, resection_plan, log, bands, *of_import)
 
 
 def check_anatomy(files: AskedFiles, asked: RehearseOptions, anatomy: LoadedAnatomy) -> None:

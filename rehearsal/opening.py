@@ -42,6 +42,8 @@ def opened(asked: RehearseOptions, process: StartedProcess | None) -> Iterator["
     files = read_files(asked)
     for warning in warning_lines(files.warnings, files.folder):
         click.echo(warning)
+    for text in files.acknowledged:
+        click.echo(f"Acknowledged warning of the import: {text}")
     with ExitStack() as resources:
         start.begin("Taichi")
         solver = None if process is None else resources.enter_context(solver_process(process))

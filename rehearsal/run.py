@@ -147,6 +147,7 @@ class RehearsalRun:
         return dict(
             complexity=None if found is None else found.figures(),
             import_warnings=list(self.files.warnings),
+            acknowledged_warnings=list(self.files.acknowledged),
         )
 
     def _replayed_steps(self, replay: Replay) -> int:

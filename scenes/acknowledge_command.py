@@ -16,7 +16,7 @@ from scenes.terminal import shell_command
 def acknowledge_command(patient: Path, yes: bool) -> None:
     """Mark the warnings of PATIENT's import as checked.
 
-    PATIENT is the folder that import made. Its warnings are then no longer shown.
+    PATIENT is the folder that import made. Its warnings are then no longer shown in the window; terminal and reports still name them.
     """
     folder = scene_file(patient).parent
     findings = read_findings(folder)
@@ -30,7 +30,7 @@ def acknowledge_command(patient: Path, yes: bool) -> None:
     if not yes:
         _ask(folder)
     acknowledge(folder, findings.open_warnings)
-    click.echo("Acknowledged: no longer shown.")
+    click.echo("Acknowledged: no longer shown in the window; terminal and reports still name it.")
 
 
 def _ask(folder: Path) -> None:

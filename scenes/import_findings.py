@@ -72,6 +72,11 @@ class ImportFindings(Section):
         """The warnings that nobody has acknowledged."""
         return tuple(each.text for each in self.warnings if not each.acknowledged)
 
+    @property
+    def acknowledged_warnings(self) -> tuple[str, ...]:
+        """The warnings that the user has acknowledged."""
+        return tuple(each.text for each in self.warnings if each.acknowledged)
+
 
 def findings_text(findings: ImportFindings) -> str:
     """The content of ``import.json``."""
@@ -96,8 +101,18 @@ def read_findings(folder: Path) -> ImportFindings | None:
 
 def open_warnings(scene: Scene, folder: Path) -> tuple[str, ...]:
     """The warnings of a scene's import that nobody has acknowledged. Raises SceneError."""
-    findings = None if scene.anatomy.phantom else read_findings(folder)
+    findings = _findings_of(scene, folder)
     return () if findings is None else findings.open_warnings
+
+
+def acknowledged_warnings(scene: Scene, folder: Path) -> tuple[str, ...]:
+    """The warnings of a scene's import that the user has acknowledged: they are still true of its images. Raises SceneError."""
+    findings = _findings_of(scene, folder)
+    return () if findings is None else findings.acknowledged_warnings
+
+
+def _findings_of(scene: Scene, folder: Path) -> ImportFindings | None:
+    return None if scene.anatomy.phantom else read_findings(folder)
 
 
 def acknowledge(folder: Path, shown: Collection[str]) -> None:

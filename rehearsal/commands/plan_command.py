@@ -90,7 +90,11 @@ def plan(asked: PlanOptions) -> None:
         made = make_plan(TrialWorkers(problem, workers), asked.speed_mm_s, asked.trials, bar.update)
         bar.update(bar.total - bar.n)
     write_plan(made, out)
-    click.echo("\n".join(made.why))
+    click.echo(
+        "\n".join(
+            [*made.why, *over_limit_warning(made.sweeps[0].parts, loaded.transducer.compression_warning_mm)]
+        )
+    )
     click.echo(
         f"Wrote {counted(len(made.sweeps), 'sweep')} to {out}; follow the first with: {rehearse_command_line(asked.scene, out, asked.probe)}"
     )
@@ -117,12 +121,27 @@ def plan_resection(asked: PlanOptions) -> None:
     best, picture = proposals[0], asked.out.with_name(f"{asked.out.name}.png")
     figures = figures_of(best.cut, best.judgement, anatomy.tumour)
     draw_page(best.cut, best.judgement, anatomy.tumour, figures, picture, "Planned resection")
-    click.echo("\n".join(filter(None, [table_of(proposals), why_first(proposals)])))
+    warnings = [
+        f"WARNING {each.settings.technique}: {text}"
+        for each in proposals
+        for text in each.judgement.warnings()
+    ]
+    click.echo("\n".join(filter(None, [table_of(proposals), why_first(proposals), *warnings])))
     if asked.margin_mm > 0:
         click.echo("An enucleation has no margin: --margin-mm 0 plans one.")
     click.echo(
-        f"Wrote {counted(len(cuts), 'cut')} to {asked.out}, and a picture of the first to {picture}; rehearse the first with: {rehearse_command_line(asked.scene, asked.out, asked.probe)}"
+        f"Wrote {counted(len(cuts), 'cut')} to {asked.out}, and a picture of the first to {picture}; rehearse the first in a window with: {rehearse_command_line(asked.scene, asked.out, asked.probe)}"
     )
+
+
+def over_limit_warning(parts: dict[str, float], limit_mm: float) -> list[str]:
+    """A warning where a sweep compresses the tissue by more than the scene's limit."""
+    if parts["compression_max_mm"] <= limit_mm:
+        return []
+    return [
+        f"WARNING the first sweep compresses the tissue by up to {parts['compression_max_mm']:.1f} mm, the limit is {limit_mm:g} mm "
+        f"(exceeded at {100 * parts['over_limit']:.0f} % of its poses)"
+    ]
 
 
 def table_of(proposals: list["Proposal"]) -> str:

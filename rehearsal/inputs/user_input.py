@@ -39,7 +39,9 @@ AFTER_ACTION = (
     *("reset", "undo", "redo", "bookmark", "to_bookmark"),
     *("score_image", "score_under", "score_planned", "cut_out"),
 )
-UNSEEN = "tumour surface seen {:.0f} %: the cut keeps no margin from the rest"
+UNSEEN = (
+    "tumour surface seen {:.0f} %: the cut keeps no margin from the rest, however much of the volume was seen"
+)
 NOTHING = {each.name: each.default for each in fields(Controls) if each.name in AFTER_ACTION}
 
 

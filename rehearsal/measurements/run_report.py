@@ -141,4 +141,4 @@ def _force(most_n: float | None) -> str:
 def _error(expected_mm: float | None) -> str:
     if expected_mm is None:
         return "error not known: study trade measured no similar settings"
-    return f"error {expected_mm:.2f} mm: mean bead error with similar settings on other kidneys, of known material (study trade)"
+    return f"error {expected_mm:.2f} mm: mean bead error with similar settings on virtual kidneys (study trade), not the error on this one"

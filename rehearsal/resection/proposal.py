@@ -119,7 +119,7 @@ def why_first(proposals: list[Proposal]) -> str:
     first, second = proposals[:2]
     costs = [cost_terms(each.judgement, each.settings.margin_mm) for each in (first, second)]
     differing = [
-        f"{name} {a:.1f} instead of {b:.1f}"
+        f"{name} {a:.1f} points instead of {b:.1f}"
         for (name, a), b in zip(costs[0].items(), costs[1].values(), strict=True)
         if f"{a:.1f}" != f"{b:.1f}"
     ]

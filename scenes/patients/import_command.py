@@ -112,7 +112,10 @@ def import_patient_command(
         ("privacy", f"{searched} names, IDs, dates, UIDs and paths of the source: none is in the files")
     )
     click.echo(as_table(rows))
-    click.echo(f"Written to {out}. Check {out / 'check.png'}, then: {shell_command('rehearse', out)}")
+    click.echo(
+        "The probe is linear, which shows most of a kidney; --probe drop-in is the robotic one.\n"
+        f"Written to {out}. Check {out / 'check.png'}, then: {shell_command('rehearse', out)}"
+    )
 
 
 def label_words(text: str, option: str) -> list[str]:

@@ -55,6 +55,7 @@ def import_request(
     tissues = tissues or {}
     segmentations: list[Segmentation] = []
     absent: tuple[str, ...] = ()
+    no_tumour: tuple[str, ...] = ()
     if seed_mm is None:
         contents = None if ct.is_file() and is_volume_file(ct) else read_dicom_headers(ct, progress)
         words = [*organ, *chain(*tissues.values())]
@@ -63,7 +64,11 @@ def import_request(
         maps = [one for segmentation in segmentations for one in segmentation.maps(volume.grid)]
         empty = [segment for segmentation in segmentations for segment in segmentation.empty]
         merged = merge_label_maps(assign_tissues(maps, organ, tissues, empty))
-        absent = absent_labels(maps, tissues)
+        tumour = {tissue: words for tissue, words in tissues.items() if tissue == "tumour"}
+        no_tumour = tuple(f"{text}; the labels are {merged.listed()}" for text in absent_labels(maps, tumour))
+        absent = absent_labels(
+            maps, {tissue: words for tissue, words in tissues.items() if tissue not in tumour}
+        )
     elif labels or organ or tissues:
         raise PatientError(
             "--seed segments the organ where there are no labels: give it, or labels, not both"
@@ -84,7 +89,12 @@ def import_request(
     )
     # Several files of one kind have the same note.
     notes = dict.fromkeys(note for segmentation in segmentations for note in segmentation.notes)
-    found = replace(patient, notes=(*patient.notes, *notes, *absent), draft=seed_mm is not None)
+    found = replace(
+        patient,
+        notes=(*patient.notes, *notes, *absent),
+        warnings=(*patient.warnings, *no_tumour),
+        draft=seed_mm is not None,
+    )
     return found, _identifiers((ct, *labels), volume, segmentations)
 
 

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 import app
 from rehearsal.asked_files import check_plan, check_reach
-from rehearsal.commands.plan_command import PlanOptions, trocar_of
+from rehearsal.commands.plan_command import PlanOptions, over_limit_warning, trocar_of
 from rehearsal.planning import trial_workers
 from rehearsal.planning.plan_file import (
     APPROACH_S,
@@ -233,6 +233,13 @@ def ball_scene(tmp_path):
     (tmp_path / "scene.toml").write_text(BALL)
     (tmp_path / "taken").touch()
     return tmp_path
+
+
+def test_a_sweep_above_the_compression_limit_is_warned_of():
+    parts = {"compression_max_mm": 11.6, "over_limit": 0.052}
+    (warning,) = over_limit_warning(parts, 8.0)
+    assert "up to 11.6 mm, the limit is 8 mm (exceeded at 5 % of its poses)" in warning
+    assert over_limit_warning(parts, 11.6) == []
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,13 @@ import pytest
 from ball_patient import folder_of_ball
 
 from app import main
-from scenes.import_findings import acknowledge, open_warnings, read_findings, warning_lines
+from scenes.import_findings import (
+    acknowledge,
+    acknowledged_warnings,
+    open_warnings,
+    read_findings,
+    warning_lines,
+)
 from scenes.scene import AnatomyFiles, Scene, SceneError
 
 TEXTS = ("the rim is fat", "two of <three> lines")
@@ -49,9 +55,11 @@ def files_scene() -> Scene:
 def test_warnings_are_open_until_they_are_acknowledged(folder):
     assert open_warnings(files_scene(), folder) == TEXTS
     assert open_warnings(Scene(anatomy=AnatomyFiles(phantom=True)), folder) == ()
+    assert acknowledged_warnings(files_scene(), folder) == ()
     before = read_findings(folder)
     acknowledge(folder, TEXTS)
     assert open_warnings(files_scene(), folder) == ()
+    assert acknowledged_warnings(files_scene(), folder) == TEXTS
     after = read_findings(folder)
     # Nothing else has changed, and no other file is left.
     assert [each.text for each in after.warnings] == list(TEXTS)

@@ -231,9 +231,24 @@ class TestLabelMaps:
 
     def test_nothing_marked(self, tmp_path):
         sitk.WriteImage(sitk.Image([8, 8, 8], sitk.sitkUInt8), str(tmp_path / "kidney_left.nii.gz"))
-        assert "1 label files are empty" in refusal(tmp_path, read=open_labels)
+        assert "kidney_left.nii.gz: is empty" in refusal(tmp_path, read=open_labels)
+        sitk.WriteImage(sitk.Image([8, 8, 8], sitk.sitkUInt8), str(tmp_path / "kidney_right.nii.gz"))
+        assert "2 label files are empty" in refusal(tmp_path, read=open_labels)
+        (tmp_path / "texts").mkdir()
+        (tmp_path / "texts" / "a.md").write_text("a")
+        assert "has no labels; expected a label map" in refusal(tmp_path / "texts", read=open_labels)
         assert "no such file" in refusal(tmp_path / "absent", read=open_labels)
         assert "has no labels" in refusal(Series(tmp_path / "ct").write(), read=open_labels)
+
+    def test_a_folder_with_one_map_is_the_map(self, tmp_path):
+        """As one organ, its two kidneys could not be told apart by their values."""
+        empty = grid_around((-33, 18, -401), (-22, 30, -385), (0.7, 0.9, 1.6), DIRECTIONS["RAS"])
+        sitk.WriteImage(drawn(empty, (1, KIDNEY), (2, TUMOUR)), str(tmp_path / "kidneys.nii.gz"))
+        of_folder, of_file = (
+            [(s.value, str(s)) for one in open_labels(path).maps(None) for s in one.segments.values()]
+            for path in (tmp_path, tmp_path / "kidneys.nii.gz")
+        )
+        assert of_folder == of_file and [value for value, _ in of_folder] == [1, 2]
 
 
 class TestSegmentations:

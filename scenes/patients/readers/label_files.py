@@ -9,6 +9,7 @@ import numpy as np
 
 from errors import PatientError
 from scenes.patients.readers.ct_series import read_dicom_headers
+from scenes.patients.readers.dicom_files import find_dicom_files
 from scenes.patients.readers.dicom_headers import DicomContents
 from scenes.patients.readers.dicom_seg import read_segmentation
 from scenes.patients.readers.label_headers import label_header
@@ -74,6 +75,11 @@ def open_labels(
         raise PatientError(f"{path}: is a surface that cannot be read here; export it as STL, PLY or OBJ")
     if of_files := _files_of_folder(path, wanted, progress):
         return of_files
+    if not find_dicom_files(path):
+        raise PatientError(
+            f"{path}: has no labels; expected a label map, one file for each organ, a DICOM segmentation or structure set, or surfaces; "
+            "choose another"
+        )
     contents = read_dicom_headers(path, progress)
     found = segmentation_of(contents, wanted, progress, belongs)
     if found is None:
@@ -91,9 +97,13 @@ def _files_of_folder(folder: Path, wanted: Collection[str], progress: Progress) 
     entries = sorted(folder.iterdir()) if folder.is_dir() else []
     surfaces = [file for file in entries if is_surface_file(file)]
     if organ_files := [file for file in entries if is_volume_file(file)]:
-        of_maps = _file_per_organ(folder, organ_files, wanted, progress)
+        of_maps = (
+            _label_map_file(organ_files[0])
+            if len(organ_files) == 1
+            else _file_per_organ(folder, organ_files, wanted, progress)
+        )
         note = f"label maps were read, and not the surfaces beside them: {len(surfaces)}"
-        return replace(of_maps, notes=(note,)) if surfaces else of_maps
+        return replace(of_maps, notes=(*of_maps.notes, note)) if surfaces else of_maps
     if not surfaces:
         return None
     near = _near(surfaces, wanted)
