@@ -21,9 +21,11 @@ from rehearsal.resection.proposal import KEPT_WITHIN_MM
 from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.score_line import ResectionError
 from rehearsal.result_files import counted, save_figure, write_json
-from render.background_image import ends_of
+from render.background_image import are_apart, ends_of
 from scenes.surfaces import signed_distance_from
 
+# Width of a letter of the compass, whose axes have length 1.
+LETTER = 0.35
 NAME = "resection"
 NOTHING_CUT = "nothing was cut, or there is no tumour to judge by"
 # Colours of the margin: in the tumour, then up to each limit, then beyond the last.
@@ -133,11 +135,13 @@ def _draw_specimen(axes: Any, faces: np.ndarray, colours: np.ndarray, title: str
 def _draw_compass(axes: Axes, seen: np.ndarray) -> None:
     """Draw the patient's axes by their letters, for a view's axes right, up, towards the eye (3, 3); ends towards the eye are dark."""
     ends = ends_of(seen * [[1], [1], [-1]])
-    for place, (letter, end) in enumerate(ends):
-        colour = NEAR_END if place >= len(ends) / 2 else FAR_END
+    places = np.array([end * (1 + 0.35 / np.linalg.norm(end)) for _, end in ends])
+    for rank, shows_letter in enumerate(are_apart(places, LETTER)):
+        (letter, end), (x, y) = ends[rank], places[rank]
+        colour = NEAR_END if rank >= len(ends) / 2 else FAR_END
         axes.plot([0, end[0]], [0, end[1]], color=colour, linewidth=1.2)
-        beyond = end * (1 + 0.35 / np.linalg.norm(end))
-        axes.text(beyond[0], beyond[1], letter, fontsize=10, color=colour, ha="center", va="center")
+        if shows_letter:
+            axes.text(x, y, letter, fontsize=10, color=colour, ha="center", va="center")
     axes.set(xlim=(-1.4, 1.4), ylim=(-1.4, 1.4), aspect="equal")
     axes.set_axis_off()
 
