@@ -251,6 +251,8 @@ class TestOneCommandForManyPatients:
             "no voxel has the cyst's label 4",
         )
         assert absent_labels(maps, {"tumour": ["2"]}) == ()
+        # As the option names it.
+        assert absent_labels(maps, {"urine": ["5"]}) == ("no voxel has the collecting system's label 5",)
         # The organ's own label must be there, but not the tumour's, of those that are given as both.
         (healthy,) = assign_tissues([LabelMap.of(mapped(kits[1], [0, 1, 0]))], ["1", "2"], {"tumour": ["2"]})
         assert list(healthy.segments) == [1]

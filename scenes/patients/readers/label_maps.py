@@ -189,7 +189,7 @@ def assign_tissues(
             )
             if not may_be_absent and not _is_among(segments, word):
                 raise PatientError(
-                    f"the {option}'s label {word} is not in the label map: it has {listed([str(s) for s in segments])}; "
+                    f"the {_in_words(option)}'s label {word} is not in the label map: it has {listed([str(s) for s in segments])}; "
                     "give one of these"
                 )
 
@@ -197,7 +197,7 @@ def assign_tissues(
         found = [tissue for tissue, words in chosen.items() if any(segment.matches(word) for word in words)]
         if len(found) > 1:
             raise PatientError(
-                f"label {segment} is given as {' and as '.join(found)}: give it as one of them"
+                f"label {segment} is given as {' and as '.join(map(_in_words, found))}: give it as one of them"
             )
         if found:
             return replace(segment, tissue=found[0])
@@ -213,11 +213,16 @@ def absent_labels(maps: list[LabelMap], chosen: Mapping[str, Sequence[str]]) -> 
     """A note for each label of a tissue (tissue -> names or values of its labels) that no voxel has."""
     segments = _segments(maps)
     return tuple(
-        f"no voxel has the {tissue}'s label {word}"
+        f"no voxel has the {_in_words(tissue)}'s label {word}"
         for tissue, words in chosen.items()
         for word in words
         if not _is_among(segments, word)
     )
+
+
+def _in_words(tissue: str) -> str:
+    """A tissue as the options of an import name it."""
+    return "collecting system" if tissue == "urine" else tissue
 
 
 def _segments(maps: list[LabelMap]) -> list[Segment]:
