@@ -95,7 +95,8 @@ def cut_organ(
     if staying_ml > LEAST_STAYING_ML:
         warnings.append(f"the cut would touch the organ in another place too; {staying_ml:.1f} ml there stay")
     specimen = pieces[0]
-    remnant, *separated = _pieces(outer if len(pieces) == 1 else whole - specimen)
+    # A flat piece, which rounding leaves, would also be a flat slit in the remnant.
+    remnant, *separated = _pieces(outer if len(inner.decompose()) == 1 else whole - specimen)
     if separated:
         # What the cut separates from the organ elsewhere, such as the rim of a tumour on a stalk, comes with the specimen.
         specimen = _pieces(whole - remnant)[0]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from cut_ball import HEIGHT_MM, MARKS, RIM_MM, R, ball, cap_mm3, circle, inset, line_on_ball
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from rehearsal.resection.cut import (
@@ -167,6 +167,9 @@ def test_a_grown_body_contains_all_balls_and_little_more(by_mm, seed):
     assert more.min() >= by_mm * (1 - 1e-9) and more.max() <= 1.05 * by_mm + 1e-9
 
 
+# In the first two, rounding leaves a flat piece beside the specimen.
+@example(63)
+@example(566)
 @given(st.integers(0, 2**31))
 @settings(max_examples=25, deadline=None)
 def test_any_cut_of_an_ellipsoid_is_closed_and_sums_to_the_whole(seed):

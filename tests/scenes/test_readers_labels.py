@@ -241,7 +241,7 @@ class TestLabelMaps:
         assert "has no labels" in refusal(Series(tmp_path / "ct").write(), read=open_labels)
 
     def test_a_folder_with_one_map_is_the_map(self, tmp_path):
-        """As one organ, its two kidneys could not be told apart by their values."""
+        """Read as one organ per file, its labels would lose their values."""
         empty = grid_around((-33, 18, -401), (-22, 30, -385), (0.7, 0.9, 1.6), DIRECTIONS["RAS"])
         sitk.WriteImage(drawn(empty, (1, KIDNEY), (2, TUMOUR)), str(tmp_path / "kidneys.nii.gz"))
         of_folder, of_file = (
