@@ -1,5 +1,6 @@
 # make run       press the embedded patient's kidney, in a window or, without a display, into out/
 # make test      everything that must hold before a change lands
+# make lint      the part of it that reads the code and runs nothing
 # make audit     whether anything pinned here is known to be vulnerable, as PyPI knows it
 # make licences  the table of THIRD_PARTY.md anew
 # Each makes what it needs: an environment in .venv and, as root on Debian or Ubuntu, the system packages.
@@ -15,22 +16,29 @@ INSTALL := -m pip install --quiet --disable-pip-version-check --no-compile
 unexport PYTHONDONTWRITEBYTECODE
 ARGS ?=
 
-# What the tests need is installed while the embedded patient is made.
+# Packages of both kinds are installed at the same time; and the embedded patient is made while the code is checked.
 MAKEFLAGS += --jobs=2
 
-.PHONY: run test audit licences clean
+.PHONY: run test lint driver screen audit licences clean
 .DELETE_ON_ERROR:
 
-run: .venv/.patient
-	@sh .ci/system-packages vulkan
+run: driver .venv/.patient
 	$(BIN)/python app.py rehearse $(ARGS)
 
-test: .venv/.dev .venv/.patient
-	@sh .ci/system-packages vulkan window
+test: screen .venv/.patient lint
+	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+lint: .venv/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+# After the environment, for which a system package may be needed too: two installations would wait for one another.
+driver: .venv/pyvenv.cfg
+	@sh .ci/system-packages vulkan
+
+screen: .venv/pyvenv.cfg
+	@sh .ci/system-packages vulkan window
 
 # Strict: a package that the service does not know is a failure, not a package without a fault.
 audit: .cache/release/.tools
