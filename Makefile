@@ -13,6 +13,8 @@ RELEASE := .cache/release/$(SCRIPTS)
 SHIPPED := .cache/shipped/$(SCRIPTS)
 # Python compiles what it imports, and stores it; to compile all that is installed takes as long as to install it.
 INSTALL := -m pip install --quiet --disable-pip-version-check --no-compile
+# What the tests need is more than what a rehearsal needs.
+PACKAGES := $(if $(filter test lint,$(MAKECMDGOALS)),requirements-dev,requirements)
 unexport PYTHONDONTWRITEBYTECODE
 ARGS ?=
 
@@ -28,7 +30,7 @@ run: driver .venv/.patient
 test: screen .venv/.patient lint
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-lint: .venv/.dev
+lint: .venv/.$(PACKAGES)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -61,19 +63,14 @@ licences: .cache/release/.tools
 	done; \
 	echo "Nephron needs Python 3.11, 3.12 or 3.13, found none; install one or name it: make PYTHON=/path/to/python3.12"; exit 1
 
-.venv/.run: requirements.txt .venv/pyvenv.cfg
-	@echo "Installing what Nephron needs into .venv: 1.1 GB, one to six minutes, once."
-	@$(BIN)/python $(INSTALL) -r requirements.txt
-	@touch $@
+.venv/.$(PACKAGES): $(PACKAGES).txt requirements.txt .venv/pyvenv.cfg
+	@echo "Installing what $(PACKAGES).txt names into .venv: 1.1 GB, one to six minutes, once."
+	@$(BIN)/python $(INSTALL) -r $(PACKAGES).txt
+	@touch .venv/.requirements $@
 
-.venv/.patient: .venv/.run
+.venv/.patient: .venv/.$(PACKAGES)
 	@echo "Making the embedded patient: fifteen seconds, once."
 	-@$(BIN)/python -c "from scenes.phantom.embedded_patient import phantom_folder; phantom_folder()"
-	@touch $@
-
-.venv/.dev: requirements-dev.txt .venv/.run
-	@echo "Installing what the tests need."
-	@$(BIN)/python $(INSTALL) -r requirements-dev.txt
 	@touch $@
 
 .cache/release/.tools: requirements-release.txt .venv/pyvenv.cfg

@@ -18,7 +18,7 @@ from rehearsal.resection.cut import Cut
 from rehearsal.resection.judgement import MARGIN_LIMITS_MM, NOT_LABELLED, Judgement, shown
 from rehearsal.resection.operation import distance_to_tumour, seen_share
 from rehearsal.resection.proposal import KEPT_WITHIN_MM
-from rehearsal.resection.resection_plan import ResectionPlan
+from rehearsal.resection.resection_plan import ResectionPlan, against_plan
 from rehearsal.resection.score_line import ResectionError
 from rehearsal.result_files import counted, save_figure, write_json
 from render.background_image import are_apart, ends_of
@@ -219,16 +219,7 @@ def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
     below = ", ".join(f"{report[f'margin_below_{limit:g}_mm2']:.0f}" for limit in MARGIN_LIMITS_MM)
     limits = ", ".join(f"{limit:g}" for limit in MARGIN_LIMITS_MM)
     plan, warnings = report.get("against_plan"), len(report.get("import_warnings", []))
-    against = (
-        []
-        if plan is None
-        else [
-            (
-                "against the plan",
-                f"cost {plan['cost_ml']:.1f} points, planned {plan['planned_cost_ml']:.1f} by {plan['planned_technique']}",
-            )
-        ]
-    )
+    against = [] if plan is None else [("against the plan", against_plan(plan))]
     return [
         ("technique", f"{report['technique']}, {depth}; {report['filling']} in the crater"),
         *([] if seen is None else [("tumour surface seen", f"{seen:.0f} %")]),

@@ -25,8 +25,15 @@ from version import FORMAT, of_this_format
 
 # The first bytes of a plan contain this.
 MARK = b'"nephron_resection"'
-# Figures of a cut that are compared with those of the plan.
-COMPARED = ("parenchyma_removed_ml", "collecting_system_opened_mm2", "margin_min_mm", "positive_margin_mm2")
+# Figures of a cut that are compared with those of the plan: how they are called, and their units.
+COMPARED = {
+    "parenchyma_removed_ml": ("parenchyma", "ml"),
+    "collecting_system_opened_mm2": ("collecting system opened", "mm2"),
+    "margin_min_mm": ("least margin", "mm"),
+    "positive_margin_mm2": ("positive margin", "mm2"),
+}
+# A difference that is written as zero is not written.
+LEAST_SHOWN = 0.05
 Place = tuple[Number, Number, Number]
 
 
@@ -85,6 +92,17 @@ class ResectionPlan(_FileModel):
             cost_ml=round(cost_ml(judgement, self.margin_mm), 2),
             **{f"{name}_more": _more(made[name], figures[name]) for name in COMPARED},
         )
+
+
+def against_plan(compared: dict[str, Any]) -> str:
+    """What ``ResectionPlan.compared`` found, in words: both costs, and in which figures the cut differs from the planned one."""
+    differing = [
+        f"{word} {more:+.1f} {unit}"
+        for name, (word, unit) in COMPARED.items()
+        if abs(more := compared[f"{name}_more"] or 0.0) >= LEAST_SHOWN
+    ]
+    costs = f"cost {compared['cost_ml']:.1f} points, planned {compared['planned_cost_ml']:.1f} by {compared['planned_technique']}"
+    return f"{costs}: {', '.join(differing)}" if differing else costs
 
 
 def _more(made: float | None, planned: JsonValue) -> float | None:

@@ -60,6 +60,8 @@ BAR: dict[str, Any] = dict(color="white", path_effects=[withStroke(linewidth=5, 
 LIGHT = np.array([-0.4, -0.8, 0.45])  # from the front, the patient's right and above
 # View azimuth [degrees], and the signs of the light's direction.
 AZIMUTH = {"from the front": (-105, np.ones(3)), "from behind": (75, np.array([-1.0, -1.0, 1.0]))}
+# Of the axes of LPS: towards which side their numbers are positive, and negative.
+SIDES = ("LR", "PA", "SI")
 # The overview has a panel where it is this many times as wide as the CT around the organ.
 LEAST_WIDER = 1.2
 DRAFT = "made by region growing from a seed, drawn by nobody: check every outline in check.png"
@@ -73,6 +75,11 @@ class CheckView:
     right: tuple[int, int, int]
     down: tuple[int, int, int]
     letters: tuple[str, str, str, str]  # left, right, top, bottom
+
+    def position(self, place: np.ndarray) -> str:
+        """Where the slice through a place (3,) [mm] lies, as viewers of CT write it: ``S 118 mm`` is 118 mm towards the head."""
+        axis = int(np.argmax(np.abs(np.cross(self.right, self.down))))
+        return f"{SIDES[axis][int(place[axis] < 0)]} {abs(place[axis]):.0f} mm"
 
 
 VIEWS = (
@@ -185,7 +192,7 @@ def _draw_slice(
         for line in [] if section is None else section.discrete:
             axes.plot(line @ right, line @ down, color=colours[name], linewidth=1.4)
     axes.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[])
-    axes.set_title(view.name, color="white", fontsize=11)
+    axes.set_title(f"{view.name}, {view.position(middle)}", color="white", fontsize=11)
     _draw_scale_bar(axes, extent)
     for letter, place in zip(view.letters, ((0.03, 0.5), (0.97, 0.5), (0.5, 0.97), (0.5, 0.03)), strict=True):
         axes.text(*place, letter, transform=axes.transAxes, fontsize=17, **LETTER)

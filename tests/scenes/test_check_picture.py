@@ -62,6 +62,12 @@ def test_a_spot_is_drawn_on_its_side(patient, view):
     assert row * PIXEL_MM + spans[1][0] == pytest.approx(spot @ down, abs=2.0)
 
 
+def test_a_slice_tells_where_it_lies_as_viewers_of_ct_do():
+    at = np.array([-31.4, 12.6, -118.2])
+    assert [view.position(at) for view in VIEWS] == ["I 118 mm", "P 13 mm", "R 31 mm"]
+    assert [view.position(-at) for view in VIEWS] == ["S 118 mm", "A 13 mm", "L 31 mm"]
+
+
 def test_outlines_and_surfaces_are_in_the_picture(patient, tmp_path):
     draw_check(patient, summary_rows(patient), tmp_path)
     picture = matplotlib.image.imread(tmp_path / "check.png")[..., :3]
