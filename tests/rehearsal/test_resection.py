@@ -432,9 +432,14 @@ def test_it_is_cut_but_once_and_page_score_and_plan_are_written_and_compared(
     report = report_of(rehearsal, plan)
     # The rehearsed line is the planned one.
     assert report["against_plan"]["parenchyma_removed_ml_more"] == pytest.approx(0.0, abs=0.05)
+    less_planned = best.judgement.report() | dict(
+        parenchyma_removed_ml=best.judgement.parenchyma_removed_ml - 2.0
+    )
+    other = plan.model_copy(update=dict(cuts=[cuts[0].model_copy(update=dict(figures=less_planned))]))
+    assert other.compared(best.judgement)["parenchyma_removed_ml_more"] == pytest.approx(2.0, abs=0.01)
     more = dict(parenchyma_removed_ml_more=1.26, margin_min_mm_more=-0.5, positive_margin_mm2_more=0.04)
-    told = against_plan(report["against_plan"] | more | dict(collecting_system_opened_mm2_more=None))
-    assert told.endswith(f" by {cuts[0].technique}: parenchyma +1.3 ml, least margin -0.5 mm")
+    difference = against_plan(report["against_plan"] | more | dict(collecting_system_opened_mm2_more=None))
+    assert difference.endswith(f" by {cuts[0].technique}: parenchyma +1.3 ml, least margin -0.5 mm")
     assert dict(rows_of(report))["against the plan"].startswith("cost ")
     page, figures = save_page(rehearsal, report, tmp_path)
     assert page.stat().st_size > 10_000 and json.loads(figures.read_text()) == report
