@@ -17,7 +17,7 @@ from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 BACKENDS = {"cuda": ti.cuda, "vulkan": ti.vulkan, "cpu": ti.cpu}
 FEW_CORES = 4
-# Taichi's default for its kernel cache is 100 MB. A rehearsal adds 4 MB for each patient and each choice of settings.
+# Taichi keeps 100 MB of compiled kernels unless told otherwise. A rehearsal adds 4 MB for each patient and each choice of settings.
 CACHE_BYTES = 1 << 30
 COUNTS = 64
 # Taichi gives a thread of a CPU at least so many iterations of a loop. A loop of fewer and longer ones runs over TASK times as many,
@@ -117,11 +117,13 @@ def is_available(arch: str) -> bool:
 
 
 def _kernel_folder() -> Path:
-    """Folder of the kernel cache: Taichi's default, or a temporary folder if that is not writable.
+    """Folder of the kernel cache: beside Taichi's default, or a temporary folder if that is not writable.
 
-    With a folder that is not writable Taichi crashes at the end of the process, even with the cache off.
+    In the default folder any other program with Taichi would remove kernels beyond its own limit. With a folder that is not writable
+    Taichi crashes at the end of the process, even with the cache off.
     """
-    usual = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or impl.default_cfg().offline_cache_file_path)
+    default = Path(impl.default_cfg().offline_cache_file_path)
+    usual = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or default.with_name("nephron"))
     try:
         usual.mkdir(parents=True, exist_ok=True)
     except OSError:

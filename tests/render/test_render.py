@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import taichi as ti
 import trimesh
 from conftest import ROOT
 from null_viewer import NullViewer
@@ -22,6 +23,7 @@ from render.software_scene import SoftwareScene
 from render.viewer import Controls, Geometry, Settings, View
 from render.warning_box import warning_image, warning_rect
 from render.window_layout import FULL_SIZE, RULER_WIDTH, WindowLayout
+from sim.device import start
 from sim.fields import fill
 
 BOUNDS = np.array([[-54.0, -33.0, -21.0], [54.0, 27.0, 21.0]])
@@ -237,10 +239,9 @@ def window(request):
 
     The parameter says whether the processor draws the 3D view; None as on this machine.
     """
-    ti = pytest.importorskip("taichi")
     from render.window import NoVulkan, Window
 
-    ti.init(arch=ti.cpu, log_level=ti.ERROR)
+    start("cpu")
     ball = trimesh.creation.icosphere(subdivisions=3, radius=ORGAN_MM)
     vertices = ball.vertices.astype(np.float32)
     field = ti.Vector.field(3, ti.f32, shape=len(vertices))
@@ -405,8 +406,6 @@ def mouse(window, monkeypatch):
     ],
 )
 def test_only_a_box_of_sliders_that_was_moved_is_made_anew(window, mouse, box, way, changes, restored):
-    import taichi as ti
-
     opened, _, _ = window
     left, top = opened._slider_boxes[box][:2] if box else opened.layout.panel[:2]
     mouse.goes(left + 30, top + 8)
@@ -468,8 +467,6 @@ def test_the_scanners_sliders_are_in_the_first_picture(window):
 
 
 def test_a_button_that_is_pressed_again_within_a_slow_frame_stays_pressed(window, mouse):
-    import taichi as ti
-
     opened, _, _ = window
     mouse.goes(opened.layout.clear.left + 100, opened.layout.clear.top + 60)
     assert not opened.read_controls().press
@@ -483,8 +480,6 @@ def test_a_button_that_is_pressed_again_within_a_slow_frame_stays_pressed(window
 
 
 def test_shift_counts_for_the_keys_pressed_with_it_also_in_a_slow_frame(window, mouse):
-    import taichi as ti
-
     opened, _, _ = window
 
     def cuts(*presses: str, releases: tuple[str, ...] = ()) -> tuple[bool, bool]:
@@ -558,7 +553,8 @@ def test_the_cut_is_filled_and_the_half_before_it_removed(window):
 
 PROBE = """
 import numpy as np, taichi as ti
-ti.init(arch=ti.cpu, log_level=ti.ERROR)
+from sim.device import start
+start("cpu")
 from render.software_scene import SoftwareScene
 from render.viewer import Geometry
 from render.window import NoVulkan, Window
@@ -572,7 +568,6 @@ except NoVulkan as reason:
 
 
 def test_missing_vulkan_is_an_error_with_a_message():
-    pytest.importorskip("taichi")
     nowhere = {"VK_ICD_FILENAMES": "/nonexistent", "VK_DRIVER_FILES": "/nonexistent"}
     done = subprocess.run(
         [sys.executable, "-c", PROBE],
