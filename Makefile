@@ -13,6 +13,8 @@ RELEASE := .cache/release/$(SCRIPTS)
 SHIPPED := .cache/shipped/$(SCRIPTS)
 # Python compiles what it imports, and stores it; to compile all that is installed takes as long as to install it.
 INSTALL := -m pip install --quiet --disable-pip-version-check --no-compile
+# The pip that comes with Python may take twice as long; where there is no newer one, it will do.
+PIP := pip==26.3
 # What the tests need is more than what a rehearsal needs.
 PACKAGES := $(if $(filter test lint,$(MAKECMDGOALS)),requirements-dev,requirements)
 unexport PYTHONDONTWRITEBYTECODE
@@ -64,6 +66,7 @@ licences: .cache/release/.tools
 	echo "Nephron needs Python 3.11, 3.12 or 3.13, found none; install one or name it: make PYTHON=/path/to/python3.12"; exit 1
 
 .venv/.$(PACKAGES): $(PACKAGES).txt requirements.txt .venv/pyvenv.cfg
+	-@$(BIN)/python $(INSTALL) $(PIP)
 	@echo "Installing what $(PACKAGES).txt names into .venv: 1.1 GB, one to six minutes, once."
 	@$(BIN)/python $(INSTALL) -r $(PACKAGES).txt
 	@touch .venv/.requirements $@

@@ -28,8 +28,8 @@ SPACINGS = {"thick": (1.3, 1.1, 4.5), "even": (1.5, 1.5, 1.5)}
 
 def coarsely(patch):
     """While a patch lasts, surfaces and supports are made on coarse grids: they are tested by themselves, and take seconds."""
-    patch.setattr("scenes.patients.label_surfaces.CELL_MM", (2.0, 2.0))
-    patch.setattr("scenes.patients.organ_support.GRID_MM", 2.0)
+    patch.setattr("scenes.patients.label_surfaces.CELL_MM", (3.0, 3.0))
+    patch.setattr("scenes.patients.organ_support.GRID_MM", 3.0)
 
 
 def level(points, solid):
