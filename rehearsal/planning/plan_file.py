@@ -46,7 +46,9 @@ class PlanError(UserError):
 
 
 class _FileModel(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    """A text is no number."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
 
 
 class PlannedSweep(_FileModel):

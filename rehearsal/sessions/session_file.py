@@ -34,7 +34,9 @@ class SessionError(UserError):
 
 
 class _Line(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    """A text is no number."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
 
 
 class Header(_Line):

@@ -155,8 +155,10 @@ def _read(path: Path) -> list[_FilePose]:
         text = path.read_text("utf-8")
         if not text.strip():
             raise PoseError(f"{path}: is empty; expected a list of poses")
-        values = _of_csv(path, text) if path.suffix.lower() == ".csv" else json.loads(text)
-        found = TypeAdapter(list[_FilePose]).validate_python(values)
+        is_csv = path.suffix.lower() == ".csv"
+        values = _of_csv(path, text) if is_csv else json.loads(text)
+        # In JSON a text is no number.
+        found = TypeAdapter(list[_FilePose]).validate_python(values, strict=not is_csv)
     except FileNotFoundError:
         raise PoseError(f"{path}: no such pose file") from None
     except UnicodeDecodeError:

@@ -81,6 +81,7 @@ ODD[3] = [0, 0, 0, 2.0]
     [
         ("nephron_plan", 1, "nephron_plan = 1: written by Nephron 1, and this is Nephron 2"),
         ("target", "liver", "input should be 'margin', 'tumour' or 'organ'"),
+        ("margin_mm", "5", "margin_mm = '5': input should be a valid number"),
         ("margin_mm", -5.0, "input should be greater than or equal to 0"),
         ("margin_mm", 1e9, "input should be less"),
         ("speed_mm_s", 0.0, "input should be greater"),

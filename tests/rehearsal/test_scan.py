@@ -75,6 +75,7 @@ def test_poses_of_both_formats_are_the_same(tmp_path):
         ),
         (json.dumps([dict(probe_to_patient=np.diag([1.0, 1, -1, 1]).tolist())]), "determinant -1"),
         (json.dumps([dict(name="a", probe_to_patient=np.eye(4).tolist())] * 2), "'a' occurs twice"),
+        (json.dumps([dict(probe_to_patient=[["1", 0, 0, 0], *np.eye(4)[1:].tolist()])]), "valid number"),
         (json.dumps([dict(name="../a", probe_to_patient=np.eye(4).tolist())]), "pose 1, name"),
     ],
 )

@@ -350,9 +350,9 @@ def test_what_is_no_session_is_said_so_in_one_line(tmp_path):
         header().model_copy(update={name: "1.0\x1b[2J"}).model_dump_json().encode()
         for name in ("version", "arch")
     )
-    no_time = header().model_dump_json().replace("0.125", "0").encode()
+    no_time, quoted = (header().model_dump_json().replace("0.125", to).encode() for to in ("0", '"0.125"'))
     strangers = b"", b"\x89PNG\r\n\x1a\n\0\0", b'{"scene": {}}\n', b"[1, 2]\n", b"[" * 100_000
-    for content in (*strangers, control, other, no_time):
+    for content in (*strangers, control, other, no_time, quoted):
         (tmp_path / "file").write_bytes(content)
         with pytest.raises(SessionError, match=r"^file: [^\n]+$"):
             read_log(tmp_path / "file")
