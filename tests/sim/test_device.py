@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import taichi as ti
+from taichi.lang.impl import default_cfg
 
 import sim.device
 from sim.device import NoDevice, start
@@ -19,6 +20,11 @@ def test_the_kernel_cache_has_space_for_many_patients(device, tmp_path):
     # Taichi removes what is too large: not from the user's folder.
     start("cpu", offline_cache_max_size_of_files=7, offline_cache_file_path=str(tmp_path))
     assert ti.cfg.offline_cache_max_size_of_files == 7
+
+
+def test_the_kernel_cache_is_not_in_the_folder_of_other_programs(monkeypatch):
+    monkeypatch.delenv("TI_OFFLINE_CACHE_FILE_PATH", raising=False)
+    assert sim.device._kernel_folder() != Path(default_cfg().offline_cache_file_path)
 
 
 @pytest.mark.parametrize("name", ["a file in the way", "new"])
