@@ -8,7 +8,7 @@ import numpy as np
 from errors import PatientError
 from scenes.atomic_files import check_folder
 from scenes.import_findings import FINDINGS_FILE, findings_text
-from scenes.patients.patient_folder import save_patient, without_identifiers
+from scenes.patients.patient_folder import public, save_patient
 from scenes.patients.patient_position import POSITIONS, Position
 from scenes.patients.readers.segment_names import Side
 from scenes.scene import scene_text
@@ -95,23 +95,18 @@ def import_patient_command(
     tissues = {TISSUE_OPTIONS[o]: label_words(text, o) for o, text in words.items() if text is not None}
     own = [] if organ is None else label_words(organ, "organ")
     seed_place = None if seed is None else position_mm(seed)
-    patient, identifiers = import_request(
-        ct, labels, own, tissues, side, series, seed_place, support, position, bar
-    )
-    patient = without_identifiers(patient, identifiers)
+    patient = import_request(ct, labels, own, tissues, side, series, seed_place, support, position, bar)
     complexity = complexity_of_patient(patient)
-    rows = summary_rows(patient, complexity)
+    written = public(patient)
+    rows = summary_rows(written, complexity)
     texts = {
         "scene.toml": scene_text(patient_scene(patient)),
-        FINDINGS_FILE: findings_text(findings_of(patient, complexity)),
+        FINDINGS_FILE: findings_text(findings_of(written, complexity)),
     }
-    searched = save_patient(
-        patient, out, texts, lambda folder: draw_check(patient, rows, folder), identifiers
-    )
-    rows.append(
-        ("privacy", f"{searched} names, IDs, dates, UIDs and paths of the source: none is in the files")
-    )
-    click.echo(as_table(rows))
+    save_patient(written, out, texts, lambda folder: draw_check(written, rows, folder))
+    click.echo(as_table(summary_rows(patient, complexity)))
+    if (written.notes, written.warnings) != (patient.notes, patient.warnings):
+        click.echo("Names of labels that may be a person's are shown here, and are not in the files.")
     click.echo(
         "The probe is linear, which shows most of a kidney; --probe drop-in is the robotic one.\n"
         f"Written to {out}. Check {out / 'check.png'}, then: {shell_command('rehearse', out)}"

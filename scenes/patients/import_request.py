@@ -1,4 +1,4 @@
-"""Carry out an import request: find CT and labels, combine them, collect the patient's identifiers (PHI)."""
+"""Carry out an import request: find CT and labels, combine them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -35,8 +35,8 @@ def import_request(
     support: str = "mould",
     position: Position | None = None,
     progress: Progress = silent,
-) -> tuple[Patient, dict[str, str]]:
-    """The imported patient, and the identifiers that none of its files may contain, with where each stands.
+) -> Patient:
+    """The imported patient.
 
     Args:
         ct, labels: paths of the user.
@@ -89,25 +89,12 @@ def import_request(
     )
     # Several files of one kind have the same note.
     notes = dict.fromkeys(note for segmentation in segmentations for note in segmentation.notes)
-    found = replace(
+    return replace(
         patient,
         notes=(*patient.notes, *notes, *absent),
         warnings=(*patient.warnings, *no_tumour),
         draft=seed_mm is not None,
     )
-    return found, _identifiers((ct, *labels), volume, segmentations)
-
-
-def _identifiers(
-    paths: Sequence[Path], volume: LazyVolume, segmentations: list[Segmentation]
-) -> dict[str, str]:
-    """The paths, as they are and as they were given, and what the files name; each with where it stands."""
-    given = [str(path.resolve()) for path in paths] + [str(path) for path in paths if len(path.parts) > 1]
-    found = dict.fromkeys(given, "the path of CT or labels")
-    sources: list[LazyVolume | Segmentation] = [volume, *segmentations]
-    for source in sources:
-        found |= source.identifiers
-    return found
 
 
 def _segmentations(

@@ -41,12 +41,7 @@ def itk_volume(path: Path, vectors: bool = False) -> LazyVolume:
     if (components != 1 and not vectors) or "complex" in kind:
         raise no_scalar(path, kind)
     metadata = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys() if key.isprintable()}
-    own = {
-        text: f"the header's field {key}"
-        for key, text in metadata.items()
-        if text and not key.startswith(("NRRD_", "ITK_", "Segment"))
-    }
-    return LazyVolume(str(path), grid, partial(_itk_box, path), identifiers=own, metadata=metadata)
+    return LazyVolume(str(path), grid, partial(_itk_box, path), metadata=metadata)
 
 
 def _itk_box(path: Path, box: Box) -> np.ndarray:

@@ -35,8 +35,6 @@ class LazyVolume:
     references: DicomReferences = NO_REFERENCES  # the DICOM objects that it consists of
     series: str = ""  # number of the DICOM series
     patient_position: str = ""  # DICOM's term, such as HFS, where there is one
-    # Of the patient (PHI), and where each stands; no written file may contain them.
-    identifiers: Mapping[str, str] = field(default_factory=dict)
     # Of a file's header, with the names of its labels.
     metadata: Mapping[str, str] = field(default_factory=dict)
 

@@ -50,13 +50,7 @@ def nifti_volume(path: Path) -> LazyVolume:
                 planes.append(_narrow(np.asarray(part)).T)
         return np.concatenate(planes)
 
-    texts = {
-        str(header[key].item(), "latin-1").strip("\0 "): f"the header's field {key}"
-        for key in ("descrip", "aux_file", "intent_name", "db_name")
-        if key in header
-    }
-    texts.pop("", None)
-    return LazyVolume(str(path), grid, read_box, identifiers=texts, metadata=_label_names(header))
+    return LazyVolume(str(path), grid, read_box, metadata=_label_names(header))
 
 
 def _label_names(header: Any) -> dict[str, str]:

@@ -146,7 +146,7 @@ def test_volume_and_place(source, tmp_path, monkeypatch, view, labels):
     # The support is tested by itself, and takes most of the time.
     monkeypatch.setattr("scenes.patients.patient_import._support", lambda kind, organ, *_: organ)
     folder, series, image = source(view)
-    patient, _ = import_request(folder, [labels(tmp_path, series, image)], side="left")
+    patient = import_request(folder, [labels(tmp_path, series, image)], side="left")
 
     measured = sitk.LabelShapeStatisticsImageFilter()
     measured.Execute(image)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import SimpleITK as sitk
-import trimesh
 from dicom_series import Series, refusal, write_segmentation, write_structures
 from synthetic_body import DIRECTIONS, drawn, grid_around
 from test_readers_labels import KIDNEY, by_name, ct_grid, ring
@@ -93,26 +92,6 @@ class TestLabelMaps:
         (one,) = open_labels(tmp_path / f"{stem}.nii.gz").maps(None)
         assert [(s.tissue, s.side) for s in one.segments.values()] == [(tissue, side)]
 
-    @pytest.mark.parametrize("form", ["file", "folder", "Slicer", "surface"])
-    def test_names_of_labels_may_be_the_patients(self, tmp_path, form):
-        """Structures are none; a warning of the import may quote any name."""
-        empty = grid_around((-33, 18, -401), (-22, 30, -385), (0.7, 0.9, 1.6))
-        image = drawn(empty, (1, KIDNEY))
-        path = tmp_path / "a" / f"Doe_left{'.stl' if form == 'surface' else '.nii.gz'}"
-        path.parent.mkdir()
-        if form == "surface":
-            trimesh.creation.icosphere(radius=30).export(path)
-        elif form == "Slicer":
-            path = path.with_name("kidney.seg.nrrd")
-            image.SetMetaData("Segment0_Name", "Doe_left")
-        if form != "surface":
-            sitk.WriteImage(image, str(path))
-        if form == "folder":
-            sitk.WriteImage(image, str(path.with_name("kidney_left.nii.gz")))
-            path = path.parent
-        identifiers = open_labels(path).identifiers
-        assert "Doe_left" in identifiers and not {"kidney_left", "kidney"} & {*identifiers}
-
     def test_organs_are_read_near_the_kidneys(self, tmp_path):
         """And all that a picture shows of them: 80 mm around."""
         empty = grid_around((-20, -20, -150), (20, 20, 150), (4.0, 4.0, 5.0), DIRECTIONS["slices first"])
@@ -141,17 +120,6 @@ class TestSegmentations:
     @pytest.fixture
     def series(self, tmp_path):
         return Series(tmp_path / "ct")
-
-    def test_identifiers_of_labels(self, series, tmp_path):
-        seg = write_segmentation(tmp_path / "seg.dcm", series, {"Kidney": np.ones(series.size[::-1])})
-        rt = write_structures(
-            tmp_path / "rt.dcm", {"Kidney": [ring(series.positions(2), 5, series.direction)]}
-        )
-        image = sitk.Compose(*[sitk.GetImageFromArray(np.ones((4, 4, 4), np.uint8))] * 2)
-        image.SetMetaData("Comment", "Doe^Jane")
-        sitk.WriteImage(image, str(tmp_path / "a.seg.nrrd"))
-        for path in (seg, rt, tmp_path / "a.seg.nrrd"):
-            assert "Doe^Jane" in open_labels(path).identifiers, path.name
 
 
 class TestContours:

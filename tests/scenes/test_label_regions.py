@@ -22,7 +22,7 @@ from test_readers_labels import by_name, ct_grid, ring
 from scenes.patients.readers import dicom_seg
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import NEAR_MM
-from scenes.patients.readers.segment_names import is_anatomy, is_needless
+from scenes.patients.readers.segment_names import is_needless, is_public
 
 NEEDLESS = [
     "BODY", "Body", "External", "external_1", "Skin", "Patient", "Patient outline", "Outer Contour", "Body contour", "whole body",
@@ -42,9 +42,9 @@ def test_needless_names():
 def test_names_of_structures_alone():
     """They identify nobody."""
     of_structures = "adrenal_gland_left|Niere links|vertebrae_L2|kidneyL|Kidney 2|BODY|left|Segment_1|portal_vein_and_splenic_vein|"
-    assert [name for name in of_structures.split("|") if not is_anatomy(name)] == []
+    assert [name for name in of_structures.split("|") if not is_public(name)] == []
     of_persons = "Doe|kidney Doe|Doe_left|kidney 19600229|Mr L"
-    assert [name for name in of_persons.split("|") if is_anatomy(name)] == []
+    assert [name for name in of_persons.split("|") if is_public(name)] == []
 
 
 class TestStructures:
@@ -65,7 +65,9 @@ class TestStructures:
         path = write_structures(tmp_path / "rt.dcm", regions)
         drawing, found = self.read(series, path)
         assert set(found) == {"Kidney", "liver", "spleen", "x"}
-        assert drawing.notes == ("not read, as they are far from the kidneys or no organ: 2 BODY, 4 heart",)
+        assert drawing.notes == (
+            "not read, as they are far from the kidneys or no organ: 2 “BODY”, 4 “heart”",
+        )
 
     @pytest.mark.parametrize("word", ["body", "2"])
     def test_what_the_user_names_is_filled(self, series, tmp_path, word):
@@ -73,7 +75,7 @@ class TestStructures:
         path = write_structures(tmp_path / "rt.dcm", {"Kidney": circles, "BODY": circles, "heart": circles})
         drawing, found = self.read(series, path, wanted=[word])
         assert set(found) == {"Kidney", "BODY"} and np.array_equal(found["BODY"], found["Kidney"])
-        assert drawing.notes == ("not read, as they are far from the kidneys or no organ: 3 heart",)
+        assert drawing.notes == ("not read, as they are far from the kidneys or no organ: 3 “heart”",)
 
     @pytest.mark.parametrize(
         ("kind", "filled"), [("EXTERNAL", False), ("SUPPORT", False), ("GTV", True), ("", True), (None, True)]
@@ -104,7 +106,7 @@ class TestStructures:
     def test_nothing_else_is_there(self, series, tmp_path):
         path = write_structures(tmp_path / "rt.dcm", {"BODY": self.circles(series)})
         message = refusal(path, read=lambda path: open_labels(path).maps(ct_grid(series)))
-        assert "no closed contour" in message and "1 BODY" in message
+        assert "no closed contour" in message and "1 “BODY”" in message
 
     def test_names_of_two_encodings(self, tmp_path, series):
         """Points are the same from both encodings of their length."""
@@ -177,7 +179,7 @@ class TestSegments:
         path = write_segmentation(tmp_path / "seg.dcm", series, {"Kidney": ones, "heart": ones, "body": ones})
         drawing = open_labels(path)
         assert set(by_name(drawing.maps(None))) == {"Kidney"} and drawing.empty == ()
-        assert drawing.notes == ("not read, as they are far from the kidneys or no organ: 2 heart, 3 body",)
+        assert drawing.notes == ("not read, as they are far from the kidneys or no organ: 2 “heart”, 3 “body”",)
         assert set(by_name(open_labels(path, ["3"]).maps(None))) == {"Kidney", "body"}
 
 

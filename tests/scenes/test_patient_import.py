@@ -191,7 +191,7 @@ class TestImport:
         with pytest.raises(PatientError, match="is on the patient's left, but its name has the other side"):
             import_patient(LazyVolume.of(ct), mirrored, side="left", margin_mm=10.0)
         other = LabelMap.of(labels, {1: "liver", 2: "spleen", 3: "stomach"})
-        with pytest.raises(PatientError, match="no label is named as a kidney: 1 liver, 2 spleen"):
+        with pytest.raises(PatientError, match="no label is named as a kidney: 1 “liver”, 2 “spleen”"):
             import_patient(LazyVolume.of(ct), other)
 
 

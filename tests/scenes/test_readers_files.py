@@ -1,4 +1,4 @@
-"""Volumes in files, in detail: values, identifiers, where a box is."""
+"""Volumes in files, in detail: values, where a box is."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from synthetic_body import DIRECTIONS, grid_around, with_voxels
-from test_readers import AIR, ENDINGS, RAS, affine_of, nifti, noise, written
+from test_readers import AIR, RAS, affine_of, nifti, noise, written
 
 from errors import PatientError
 from scenes.patients.readers.ct_series import open_ct
-from scenes.patients.readers.label_files import open_labels
 from scenes.volumes.voxel_grid import VoxelGrid
 
 
@@ -22,17 +21,6 @@ class TestFiles:
         voxels[0, 0, :2] = 40_000, -40_000
         path = written(tmp_path / f"ct{ending}", with_voxels(noise(), voxels))
         assert open_ct(path).hounsfield()[0, 0, :2].tolist() == [32767, AIR]
-
-    @pytest.mark.parametrize("ending", ENDINGS)
-    def test_identifiers_of_a_header(self, tmp_path, ending):
-        path = tmp_path / f"a{ending}"
-        if ending.startswith(".nii"):
-            nifti(path, noise(), descrip=b"Doe^Jane")
-        else:
-            marked = noise()
-            marked.SetMetaData("descrip", "Doe^Jane")
-            written(path, marked)
-        assert "Doe^Jane" in open_ct(path).identifiers and "Doe^Jane" in open_labels(path).identifiers
 
     def test_what_no_memory_holds_is_refused_with_what_it_takes(self, tmp_path, monkeypatch):
         ct = open_ct(written(tmp_path / "ct.mha", noise()))

@@ -390,7 +390,7 @@ class TestTogether:
         mass, kidney = assign_tissues(maps, ["kidney_left"], {"cyst": ["MASS"]})
         assert [s.tissue for one in (mass, kidney) for s in one.segments.values()] == ["cyst", "kidney"]
         with pytest.raises(
-            PatientError, match="label 4 is not in the label map: it has 1 mass, 1 kidney_left"
+            PatientError, match="label 4 is not in the label map: it has 1 “mass”, 1 “kidney_left”"
         ):
             assign_tissues(maps, ["4"], {})
         with pytest.raises(PatientError, match="given as cyst and as tumour: give it as one"):

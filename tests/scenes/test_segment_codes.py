@@ -177,7 +177,7 @@ def test_coded_segments_beside_the_organ_are_known(tmp_path):
     beside = plain.segments[3]
     (path,) = [slicer_file(tmp_path / "a.seg.nrrd", ("Segment_1", codes_of("spleen")))]
     (segment,) = [s for one in open_labels(path).maps(None) for s in one.segments.values() if s.name]
-    assert str(segment) == "1 Segment_1 (spleen)"
+    assert str(segment) == "1 “Segment_1” (“spleen”)"
     for known, warned in ((segment, 0), (beside, 1)):
         one = LabelMap(plain.grid, plain.values, {**plain.segments, 3: known})
         piece = find_organs(one, [2])[0]

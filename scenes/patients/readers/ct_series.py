@@ -11,7 +11,6 @@ import numpy as np
 from errors import PatientError
 from scenes.patients.readers.dicom_files import SourceFile, find_dicom_files
 from scenes.patients.readers.dicom_headers import DicomContents, DicomSlice, Series, read_headers
-from scenes.patients.readers.identifiers import identifiers_of
 from scenes.patients.readers.label_headers import label_header
 from scenes.patients.readers.label_maps import listed
 from scenes.patients.readers.series_choice import (
@@ -197,7 +196,6 @@ def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume
         references=series.references,
         series=series.number if series.number.isdecimal() else "",
         patient_position=positions.pop() if len(positions) == 1 else "",
-        identifiers=identifiers_of(slices[0].item),
     )
 
 

@@ -15,7 +15,6 @@ from pydicom.uid import ExplicitVRLittleEndian, generate_uid
 from errors import PatientError, parsing
 from scenes.patients.readers.dicom_files import MOST_INFLATED, SourceFile
 from scenes.patients.readers.dicom_headers import TAGS, slices_of
-from scenes.patients.readers.identifiers import identifiers_of
 from scenes.patients.readers.label_headers import references_of
 from scenes.patients.readers.label_maps import LabelMap, Segment, Segmentation, is_left_out, note_of_left_out
 from scenes.patients.readers.segment_codes import dicom_meaning
@@ -66,7 +65,6 @@ def read_segmentation(
     return Segmentation(
         lambda _: maps,
         notes=(*notes, *note_of_left_out(left_out)),
-        identifiers=identifiers_of(item),
         references=references,
         grid=grid,
         empty=tuple(one for one in kept if all(one not in each.segments.values() for each in maps)),

@@ -26,7 +26,6 @@ from scenes.patients.readers.segment_codes import slicer_meaning
 from scenes.patients.readers.segment_names import (
     is_far,
     is_needless,
-    names_that_may_identify,
     side_of,
     tissue_of,
 )
@@ -38,7 +37,6 @@ from scenes.volumes.dicom_references import DicomReferences
 from scenes.volumes.lazy_volume import LazyVolume
 from scenes.volumes.volume_files import ENDINGS, file_volume, is_volume_file
 
-NAME_OF_LABEL = "the name of a label or its file"
 SLICER_KEY = re.compile(r"Segment(\d+)_Name$")
 
 
@@ -162,11 +160,8 @@ def _label_map_file(path: Path) -> Segmentation:
         maps = [
             replace(maps[0], segments={value: replace(segment, tissue="kidney") if is_kidney else segment})
         ]
-    called = [segment.name for one in maps for segment in one.segments.values()]
-    called += [segment.name for segment in unused.values()]
     return Segmentation(
         lambda _: maps,
-        identifiers={**volume.identifiers, **names_that_may_identify(called, NAME_OF_LABEL)},
         grid=volume.grid,
         empty=tuple(unused.values()),
     )
@@ -204,11 +199,9 @@ def _file_per_organ(
     near.sort(key=lambda file: tissue_of(_stem(file)) != "kidney")
     maps: list[LabelMap] = []
     empty: list[Segment] = []
-    identifiers = names_that_may_identify(map(_stem, files), NAME_OF_LABEL)
     around: np.ndarray | None = None
     for file in progress(near, "labels"):
         volume = file_volume(file)
-        identifiers |= volume.identifiers
         is_kidney = tissue_of(_stem(file)) == "kidney"
         box = volume.grid.full_box()
         if around is not None and not is_kidney:
@@ -228,7 +221,7 @@ def _file_per_organ(
         raise PatientError(
             f"{folder}: all {len(near)} label files are empty; expected an organ; choose other labels"
         )
-    return Segmentation(lambda _: maps, identifiers=identifiers, grid=volume.grid, empty=tuple(empty))
+    return Segmentation(lambda _: maps, grid=volume.grid, empty=tuple(empty))
 
 
 def _near(files: list[Path], wanted: Collection[str]) -> list[Path]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import SimpleITK as sitk
@@ -11,7 +11,15 @@ from scipy import ndimage
 
 from errors import PatientError
 from scenes.patients.readers.segment_codes import CodedMeaning
-from scenes.patients.readers.segment_names import Side, is_needless, is_understood, side_of, tissue_of
+from scenes.patients.readers.segment_names import (
+    Side,
+    is_needless,
+    is_understood,
+    quoted,
+    same_name,
+    side_of,
+    tissue_of,
+)
 from scenes.volumes.dicom_references import NO_REFERENCES, DicomReferences
 from scenes.volumes.voxel_grid import Box, VoxelGrid
 
@@ -69,11 +77,12 @@ class Segment:
 
     def matches(self, word: str) -> bool:
         """Whether a user's word is its name or its value."""
-        return word.casefold() == self.name.casefold() or (self.value is not None and word == str(self.value))
+        return same_name(word, self.name) or (self.value is not None and word == str(self.value))
 
     def __str__(self) -> str:
-        meaning = f"({self.meaning})" if self.meaning else ""
-        return " ".join(str(part) for part in (self.value, self.name, meaning) if part not in (None, ""))
+        name, meaning = (quoted(words) if words else "" for words in (self.name, self.meaning))
+        parts = (self.value, name, f"({meaning})" if meaning else "")
+        return " ".join(str(part) for part in parts if part not in (None, ""))
 
 
 @dataclass(frozen=True)
@@ -123,7 +132,6 @@ class Segmentation:
 
     maps: Callable[[VoxelGrid], list[LabelMap]]  # on the CT's grid
     notes: tuple[str, ...] = ()
-    identifiers: Mapping[str, str] = field(default_factory=dict)  # as those of ``LazyVolume``
     references: DicomReferences = NO_REFERENCES  # the DICOM objects that they refer to
     grid: VoxelGrid | None = None  # of label maps: all voxels of the first
     empty: tuple[Segment, ...] = ()  # segments that no voxel has

@@ -8,7 +8,6 @@ from skimage.draw import polygon
 
 from errors import PatientError, parsing
 from scenes.patients.readers.dicom_files import SourceFile
-from scenes.patients.readers.identifiers import identifiers_of
 from scenes.patients.readers.label_headers import references_of
 from scenes.patients.readers.label_maps import (
     NEAR_MM,
@@ -73,7 +72,6 @@ def read_structures(
     return Segmentation(
         maps,
         notes=notes,
-        identifiers=identifiers_of(item),
         references=references,
         empty=tuple(segment for segment, points in contours if not points),
     )

@@ -1,34 +1,39 @@
-"""Recognise the tissue and the side of a segment by its name."""
+"""Recognise the tissue and the side of a segment by its name, and structures that are derived from others for planning."""
 
 import re
-from collections.abc import Iterable
+import unicodedata
 from typing import Literal
 
 Side = Literal["left", "right"]
 
-# The first match counts: a renal mass is a tumour and a kidney cyst a cyst, not a kidney. "": a known structure that is not modelled.
+# Patterns are for plain names (``_plain``): lower case, without accents, one space between words. The first match counts: a renal mass is a
+# tumour and a kidney cyst a cyst, not a kidney. "": a known structure that is not modelled. English, and the words of German, French,
+# Spanish, Italian, Portuguese, Dutch, Chinese and Japanese that segments are commonly named with.
 TISSUE_OF_NAME: tuple[tuple[str, str], ...] = (
-    ("", r"adrenal|suprarenal|gall ?bladder|cystic duct|spleen|milz|pancrea|stomach|colon|bowel|duoden|intestin|diaphragm|lymph|skin|\bbody\b|external"),
-    ("tumour", r"tumou?r|tumeur|\bmass\b|\bmasse\b|raumforderung|lesion|läsion|neoplas|carcinom|karzinom|cancer|krebs|malignan|\b[cp]?rcc\b|\bgtv"),
-    ("cyst", r"\bcysts?\b|zyste|\bkyste|\bquiste"),
-    ("stone", r"\bstones?\b|calcul|lithiasis|nierenstein"),
-    ("urine", r"collecting|renal pelvis|pelvis renal|pelvical|caly[xc]|calic|ureter|uret[eè]re|urinary|urine|nierenbecken|harn"),
-    ("vessel", r"arter(y|ies|ia)? (and|or|und|et) |vessel|vaisseau|gefäß|vascul"),
-    ("artery", r"arter|aorta"),
-    ("vein", r"\bveins?\b|\bvenen?\b|\bvena\b|\bveine|venous|\bivc\b"),
+    ("", r"adrenal|suprarenal|gall ?bladder|cystic duct|spleen|milza?\b|pancrea|stomach|colon|bowel|duoden|intestin|diaphragm|lymph(?!om)|skin|\bbody\b|external"),
+    ("tumour", r"tum(o|ou|eu)r|\bmass(es|e|a)?\b|\bmasas?\b|raumforderung|l(e|a|ae)sion|lesao|lesoes|laesie|neoplas|neoform|neubild|geschwulst|carcino|karzin|cancer|cancro|krebs|malign|"
+               r"sar[ck]om|blastom|lymphom|metasta|adenom|nodul|knoten|nephrom|angiomyolip|\bamls?\b|on[ck]o[cz]yt|\b(cc|p|ch|nc)?rcc\b|\bgtv|肿瘤|腫瘍|腫瘤|肿块"),
+    ("cyst", r"\bcysts?\b|zyste|\bkystes?\b|\bquistes?\b|\bcisti\b|\bcistos?\b|\bcysten?\b|bosniak|囊肿|嚢胞"),
+    ("stone", r"\bstones?\b|calcul|lithiasis|litiasi|nierenstein|\bpiedras?\b|结石|結石"),
+    ("urine", r"collecting|renal pelvis|pelvis renal|pelvi renal|pelvical|caly[xc]|calic|ureter|urinary|urine|pyelo|bassinet|nierenbecken|kelch|harn|输尿管|尿管|肾盂|腎盂"),
+    ("vessel", r"arter(y|ies|ia)? (and|or|und|et) |vessel|vaisseau|gefa(e|s)?s|vascul|血管"),
+    ("artery", r"arter|aorta|动脉|動脈"),
+    ("vein", r"\bveins?\b|\bvenen?\b|nierenvene|\bvenas?\b|\bveine|\bveias?\b|venous|\bivc\b|静脉|静脈"),
     ("medulla", r"medulla|pyramid"),
     ("cortex", r"renal cortex|kidney cortex|cortex of (the )?kidney"),
     ("sinus", r"renal sinus|sinus fat"),
-    ("kidney", r"kidneys?\b|\brenal\b|\bren\b|\bniere|\breins?\b|\briñ[oó]n"),
-    ("liver", r"\bliver\b|hepat|\bleber\b|\bfoie\b"),
-    ("bone", r"vertebra|\bribs?\b|\bbones?\b|\bspine\b|sacrum|\bhip\b|femur|sternum|scapula|humerus|clavicula|costal"),
-    ("muscle", r"muscle|psoas|autochthon|gluteus|quadratus"),
-    ("fat", r"\bfat\b|adipose"),
+    ("fat", r"(peri|para)(renal|nephric) fat"),
+    ("", r"fascia|gerota|(peri|para)(renal|nephr)|(kidney|renal|nephrectomy) (bed|capsule|hilum|hilus|space)\b"),
+    ("kidney", r"kidneys?\b|\brenal\b|\bren\b|\brene\b|\breni\b|\brenes\b|\bniere|\bnier\b|\breins?\b|\brinon(es)?\b|\brim (direito|esquerdo)\b|\brins\b|肾|腎"),
+    ("liver", r"\bliver\b|hepat|\bleber\b|\bfoie\b|\bhigado\b|\bfigado\b|\bfegato\b|肝"),
+    ("bone", r"vertebr|\bribs?\b|\bbones?\b|\bspine\b|sacrum|\bhip\b|femur|sternum|scapula|humerus|clavicula|costal|knochen|wirbel"),
+    ("muscle", r"muscle|muskel|psoas|autochthon|gluteus|quadratus"),
+    ("fat", r"\bfat\b|adipose|fett"),
 )  # fmt: skip
 # Structures of TotalSegmentator that are too far from a kidney to be in its image.
 FAR = (
     r"brain|skull|\bface\b|heart|atri(um|al)|ventric|myocard|lung|pulmon|humerus|clavic|scapula|femur|sacrum|\bhips?\b|"
-    r"vertebrae (c\d|t[1-8]\b)|rib (left|right) [1-7]\b|trachea|o?esophagus|thyroid|prostate|bladder|gluteus|"
+    r"vertebrae (c\d|t[1-8]\b)|rib (left|right) [1-7]\b|trachea|(o|oe)?esophagus|thyroid|prostate|bladder|gluteus|"
     r"brachiocephal|subclavian|carotid|sternum|costal|spinal cord|iliac (artery|vena)"
 )
 # What encloses or carries the patient, and is no organ.
@@ -36,27 +41,331 @@ OUTLINE = (
     r"^(whole |outer )?(body|skin|patient|external|outline|contour)( (contour|outline|surface|skin))?( \d+)?$|couch|"
     r"\btable ?(top)?$|^mattress"
 )
-# Words that are in names of structures, and mean none alone.
-BESIDE_STRUCTURES = (
-    r"\b(and|of|the|gland|lobe|upper|middle|lower|small|large|inferior|superior|cava|portal|splenic|maximus|medius|minimus|cartilages?|"
-    r"[ctls]\d+|segment|label)\b"
+# Structures that are derived from others by a margin or for the planning of a treatment, as TG-263 (doi 10.1016/j.ijrobp.2017.12.013) and
+# its users name them: PRV, CTV, PTV, ITV, a "z" before the name for optimisation, "~" for a part. A GTV is the tumour itself.
+DERIVED = (
+    r"\b(prv|i?[cp]tv|itv|igtv)|\bring\b|\bopt(i|im|imi[sz]\w+)?\b|\bmargins?\b|\bbbox\b|bounding box|\bexp\b|\bexp(and|ans)\w+|\bdilat\w+|"
+    r"\bero(ded|sion)\b|\bshell\b|\bhull\b|\bhalo\b|\bavoid(ance)?\b|\beval\b|\bcropp?(ed)?\b|\bminus\b|\bsubtract\w*|\bwithout\b|\bexcl(uding)?\b|"
+    r"\bohne\b|\bsans\b|\b(iso)?dose\b|\bnormal tissue\b"
 )
+DERIVED_SIGNS = r"^z(?=[A-Z_ ])|~|[+-]\s*\d+([.,]\d+)?\s*(mm|cm)\b"
+# "Kidney_L-GTV": the kidney without the tumour.
+DIFFERENCE = r"(?i)(.*\w)\s*[-–\\]\s*i?gtv"
 SIDE_OF_NAME: tuple[tuple[Side, str], ...] = (
-    ("left", r"\b(left|lt|l|links|gauche|sinister|sinistra)\b"),
-    ("right", r"\b(right|rt|r|rechts|droite?|dexter|dextra)\b"),
+    ("left", r"\b(left|lt|l|links|linke[nrs]?|gauche|sinister|sinistr[aeo]|izquierd[ao]s?|esquerd[ao])\b|左"),
+    (
+        "right",
+        r"\b(right|rt|r|rechts|rechte[nrs]?|droite?|dexter|dextra|destr[aeo]|derech[ao]s?|direit[ao])\b|右",
+    ),
+)
+WITHHELD = "“...”"
+# The words that names of segments may have in a patient's folder; a name with another word may be a person's.
+PUBLIC_WORDS = frozenset(
+    [
+        "a",
+        "abdominal",
+        "accessory",
+        "adenoma",
+        "adipose",
+        "adrenal",
+        "aml",
+        "and",
+        "angiomyolipoma",
+        "angiomyolipomas",
+        "aorta",
+        "arteria",
+        "arteries",
+        "artery",
+        "autochthon",
+        "avoid",
+        "back",
+        "bbox",
+        "befund",
+        "bladder",
+        "blood",
+        "body",
+        "bone",
+        "bones",
+        "bosniak",
+        "both",
+        "bowel",
+        "brachiocephalic",
+        "brain",
+        "bright",
+        "calyces",
+        "calyx",
+        "cancer",
+        "carcinoma",
+        "carotid",
+        "cartilage",
+        "cartilages",
+        "cava",
+        "ccrcc",
+        "central",
+        "chrcc",
+        "clavicula",
+        "clear",
+        "cm",
+        "collecting",
+        "collector",
+        "colon",
+        "contrast",
+        "cord",
+        "cortex",
+        "cortical",
+        "costal",
+        "couch",
+        "crop",
+        "ct",
+        "ctv",
+        "cyst",
+        "cystic",
+        "cysts",
+        "dark",
+        "deep",
+        "derecha",
+        "derecho",
+        "destro",
+        "direito",
+        "dose",
+        "draft",
+        "droit",
+        "droite",
+        "duct",
+        "duodenum",
+        "endophytic",
+        "esophagus",
+        "esquerdo",
+        "eval",
+        "exophytic",
+        "exp",
+        "expanded",
+        "external",
+        "face",
+        "fascia",
+        "fat",
+        "femur",
+        "finding",
+        "fluid",
+        "foie",
+        "gallbladder",
+        "gauche",
+        "gerota",
+        "gland",
+        "glands",
+        "gluteus",
+        "gtv",
+        "gtvn",
+        "gtvp",
+        "harnleiter",
+        "heart",
+        "hepatic",
+        "hilar",
+        "hilum",
+        "hip",
+        "hips",
+        "hull",
+        "humerus",
+        "i",
+        "igtv",
+        "ii",
+        "iii",
+        "iliac",
+        "iliopsoas",
+        "inferior",
+        "inner",
+        "intestine",
+        "itv",
+        "iv",
+        "ivc",
+        "izquierda",
+        "izquierdo",
+        "kidney",
+        "kidneys",
+        "knoten",
+        "kyste",
+        "l",
+        "label",
+        "laesion",
+        "large",
+        "lasion",
+        "lateral",
+        "leber",
+        "left",
+        "lesion",
+        "lesione",
+        "lesions",
+        "links",
+        "liver",
+        "lobe",
+        "lower",
+        "lt",
+        "lumbar",
+        "lung",
+        "lungs",
+        "lymph",
+        "main",
+        "margin",
+        "mass",
+        "masse",
+        "masses",
+        "maximus",
+        "medial",
+        "medius",
+        "medulla",
+        "metastasis",
+        "middle",
+        "milz",
+        "minimus",
+        "minus",
+        "mm",
+        "muscle",
+        "myocardium",
+        "necrosis",
+        "necrotic",
+        "niere",
+        "nieren",
+        "nierenarterie",
+        "nierenbecken",
+        "nierentumor",
+        "nierenvene",
+        "node",
+        "nodes",
+        "nodul",
+        "nodule",
+        "nodules",
+        "nodulo",
+        "nodulos",
+        "oesophagus",
+        "of",
+        "oncocytoma",
+        "opt",
+        "or",
+        "organ",
+        "outer",
+        "pancreas",
+        "papillary",
+        "pararenal",
+        "parenchyma",
+        "part",
+        "pelvis",
+        "perirenal",
+        "pole",
+        "portal",
+        "prcc",
+        "prostate",
+        "prv",
+        "psoas",
+        "ptv",
+        "pyramid",
+        "pyramids",
+        "quadratus",
+        "quiste",
+        "r",
+        "raumforderung",
+        "rcc",
+        "rechts",
+        "rein",
+        "ren",
+        "renal",
+        "renale",
+        "renalis",
+        "rene",
+        "rib",
+        "ribs",
+        "right",
+        "rim",
+        "ring",
+        "rinon",
+        "rinones",
+        "roi",
+        "rt",
+        "sacrum",
+        "scapula",
+        "segment",
+        "segments",
+        "shell",
+        "sinistro",
+        "sinus",
+        "skin",
+        "skull",
+        "small",
+        "solid",
+        "space",
+        "spinal",
+        "spine",
+        "spleen",
+        "splenic",
+        "sternum",
+        "stomach",
+        "stone",
+        "stones",
+        "subclavian",
+        "superior",
+        "system",
+        "table",
+        "target",
+        "the",
+        "thick",
+        "thin",
+        "thyroid",
+        "tissue",
+        "total",
+        "trachea",
+        "trunk",
+        "tumeur",
+        "tumor",
+        "tumors",
+        "tumour",
+        "tumours",
+        "upper",
+        "ureter",
+        "uretere",
+        "ureters",
+        "urinary",
+        "urine",
+        "v",
+        "vasos",
+        "vein",
+        "veins",
+        "vena",
+        "venous",
+        "vertebra",
+        "vertebrae",
+        "vessel",
+        "vessels",
+        "vi",
+        "wall",
+        "whole",
+        "with",
+        "z",
+        "zring",
+        "zyste",
+    ]
 )
 
 
 def tissue_of(name: str) -> str | None:
-    """The tissue of ``ultrasound/acoustic_tissues.toml`` that a name means, or None."""
+    """The tissue of ``ultrasound/acoustic_tissues.toml`` that a name means; None where it means none, or is of a derived structure."""
     plain = _plain(name)
     found = next((tissue for tissue, pattern in TISSUE_OF_NAME if re.search(pattern, plain)), "")
-    return found or None
+    return None if is_derived(name) else found or None
 
 
 def is_understood(name: str) -> bool:
     """Whether a name is of a known structure, modelled or not."""
-    return bool(name) and any(re.search(pattern, _plain(name)) for _, pattern in TISSUE_OF_NAME)
+    plain = _plain(name)
+    return bool(name) and (
+        is_derived(name) or any(re.search(pattern, plain) for _, pattern in TISSUE_OF_NAME)
+    )
+
+
+def is_derived(name: str) -> bool:
+    """Whether a name is of a structure that was made from another, for example by a margin, and is no organ."""
+    if re.search(DERIVED, _plain(name)) or re.search(DERIVED_SIGNS, name):
+        return True
+    difference = re.match(DIFFERENCE, name)
+    return difference is not None and tissue_of(difference[1]) == "kidney"
 
 
 def is_far(name: str) -> bool:
@@ -69,25 +378,20 @@ def is_needless(name: str) -> bool:
     return is_far(name) or re.search(OUTLINE, _plain(name)) is not None
 
 
-def is_anatomy(text: str) -> bool:
-    """Whether all words of a text are of structures and sides, which identify nobody; short numbers are no words."""
-    plain = _plain(text)
-    patterns = [
-        *(pattern for _, pattern in (*TISSUE_OF_NAME, *SIDE_OF_NAME)),
-        FAR,
-        OUTLINE,
-        BESIDE_STRUCTURES,
-    ]
-    known = [found.span() for pattern in patterns for found in re.finditer(pattern, plain)]
-    return all(
-        any(start < word.end() and word.start() < end for start, end in known)
-        for word in re.finditer(r"[^\W\d_]+|\d{4,}", plain)
-    )
+def is_public(name: str) -> bool:
+    """Whether all words of a name are of structures and sides, which identify nobody; numbers of up to three digits are no words."""
+    words = re.findall(r"[^\W\d_]+|\d{4,}", _plain(name))
+    return all(word in PUBLIC_WORDS for word in words)
 
 
-def names_that_may_identify(names: Iterable[str], place: str) -> dict[str, str]:
-    """The names that have other words than structures and sides, such as the patient's, and where they stand."""
-    return {name: place for name in names if not is_anatomy(name)}
+def quoted(name: str) -> str:
+    """A name of the source in a sentence, in quotation marks, by which ``public_text`` finds it."""
+    return f"“{re.sub('[“”]', '', name)}”"
+
+
+def public_text(sentence: str) -> str:
+    """A sentence for a patient's folder: names in quotation marks that may be a person's are replaced by three dots."""
+    return re.sub("“([^”]*)”", lambda match: match[0] if is_public(match[1]) else WITHHELD, sentence)
 
 
 def side_of(name: str) -> Side | None:
@@ -97,7 +401,14 @@ def side_of(name: str) -> Side | None:
     return found[0] if len(found) == 1 else None
 
 
+def same_name(one: str, other: str) -> bool:
+    """Whether two names are the same text but for case, and for how letters with accents are encoded."""
+    first, second = (unicodedata.normalize("NFC", name).casefold().strip() for name in (one, other))
+    return first == second
+
+
 def _plain(name: str) -> str:
-    """Lower case, one space between words: kidneyL, kidney_L and "Kidney-L" become equal."""
-    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
-    return re.sub(r"[\W_]+", " ", apart).strip().lower()
+    """Lower case without accents, one space between words: kidneyL, kidney_L and "Kidney-L" become equal, and Läsion is lasion."""
+    letters = "".join(c for c in unicodedata.normalize("NFKD", name) if not unicodedata.combining(c))
+    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", letters)
+    return re.sub(r"[\W_]+", " ", apart).strip().casefold()

@@ -9,8 +9,7 @@ import trimesh
 
 from errors import PatientError
 from scenes.patients.readers.label_maps import LabelMap, Segment, Segmentation
-from scenes.patients.readers.segment_names import names_that_may_identify
-from scenes.surfaces import SPACE_FIELD, Space, file_comments, in_lps, read_triangles, stated_space
+from scenes.surfaces import Space, in_lps, read_triangles, stated_space
 from scenes.terminal import Progress
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -44,7 +43,6 @@ def read_surfaces(files: Sequence[Path], near_mm: float, progress: Progress) -> 
     """
     spaces = {file: stated_space(file) for file in files}
     surfaces = {file: in_lps(_closed(file), spaces[file]) for file in progress(files, "surfaces")}
-    texts = [SPACE_FIELD.sub("", text).strip() for file in files for text in file_comments(file)]
 
     def maps(ct: VoxelGrid) -> list[LabelMap]:
         for file, surface in surfaces.items():
@@ -63,8 +61,6 @@ def read_surfaces(files: Sequence[Path], near_mm: float, progress: Progress) -> 
     return Segmentation(
         maps,
         notes=(f"surfaces that state no coordinate system were taken as LPS: {assumed}",) if assumed else (),
-        identifiers=names_that_may_identify(texts, "the comment in a surface's file")
-        | names_that_may_identify((file.stem for file in files), "the name of a surface's file"),
     )
 
 

@@ -35,12 +35,7 @@ def only_volume(folder: Path, files: list[Path]) -> LazyVolume:
         )
     volume = file_volume(images[0])
     chosen = f"of {len(files)} volume files, the one that is not named as labels was taken as the CT"
-    paths = dict.fromkeys((str(images[0]), str(images[0].resolve())), "the path of the CT")
-    return replace(
-        volume,
-        notes=(*volume.notes, *(chosen,) * (len(files) > 1)),
-        identifiers={**volume.identifiers, **paths},
-    )
+    return replace(volume, notes=(*volume.notes, *(chosen,) * (len(files) > 1)))
 
 
 def _is_named_as_labels(file: Path) -> bool:

@@ -1,0 +1,143 @@
+"""Nothing in a patient's folder names the patient: not by a search afterwards, but by what is copied."""
+
+import json
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from dicom_series import PERSON, Series, write_structures
+from pydicom.dataset import Dataset
+from synthetic_body import DIRECTIONS, LEFT, TUMOUR, body, coarsely, level
+
+from app import main
+from scenes.patients.readers.segment_names import public_text, quoted
+
+# In every text that a source has, under names that are words of the program's own sentences, too.
+TEXTS = ("Long^Small", "Wolpertinger", "X-22-ID", "St Elsewhere", "calls himself Jim", "19600229", "Ünal")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse():
+    with pytest.MonkeyPatch.context() as patch:
+        coarsely(patch)
+        yield
+
+
+def contents(folder: Path) -> bytes:
+    """All bytes of a folder's files, with voxels and pictures decompressed."""
+    found = []
+    for file in sorted(folder.iterdir()):
+        head, _, packed = file.read_bytes().partition(b"\n\n")
+        found.append(
+            head + zlib.decompress(packed, wbits=31) if file.suffix == ".nrrd" else file.read_bytes()
+        )
+    return b"\n".join(found)
+
+
+def in_any_encoding(text: str) -> set[bytes]:
+    return {text.encode(encoding) for encoding in ("utf-8", "utf-16-le", "latin-1")}
+
+
+def from_dicom(folder: Path) -> list[Path]:
+    """A series and a structure set whose elements, private ones, paths and names of regions all name the patient."""
+
+    def hounsfield(places):
+        found = np.where(level(places, (np.zeros(3), np.array([160.0, 110.0, 400.0]))) < 0, 40.0, -1000.0)
+        found[level(places, LEFT) < 0] = 120
+        return found
+
+    def edit(data, _=None):
+        inner = Dataset()
+        inner.PatientName = "Wolpertinger^Long"
+        data.PatientName, data.RequestAttributesSequence = "Long^Small", [inner]
+        data.ImageComments, data.InstitutionName = "calls himself Jim", "St Elsewhere"
+        data.OtherPatientIDs, data.SeriesDescription = ["X-1", "X-22-ID"], "Ünal"
+        data.private_block(0x0099, "MAKER", create=True).add_new(1, "LO", "Wolpertinger")
+
+    series = Series(
+        folder / "Long_Small" / "ct",
+        DIRECTIONS["identity"],
+        size=(88, 61, 36),
+        gap=3.5,
+        origin=(-174.0, -120.0, -56.0),
+        slope=1,
+    )
+    series.spacing = (4.0, 4.0)
+    series.stored = np.stack([series._stored(hounsfield, k) for k in range(36)])
+    series.write(edit=edit)
+    angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+
+    def rings(solid):
+        for k in range(36):
+            z = series.positions(k)[2]
+            share = 1 - ((z - solid[0][2]) / solid[1][2]) ** 2
+            if share > 0.02:
+                around = np.column_stack([np.cos(angle), np.sin(angle)]) * np.sqrt(share) * solid[1][:2]
+                yield np.column_stack([solid[0][:2] + around, np.full(60, z)])
+
+    regions = {
+        "Kidney_L": list(rings(LEFT)),
+        "GTV Wolpertinger": list(rings(TUMOUR)),
+        "Ünal": list(rings((LEFT[0], np.array([9.0, 9.0, 12.0])))),
+    }
+    return [series.folder, write_structures(folder / "rt.dcm", regions, series.uid, edit=edit)]
+
+
+def from_slicer(folder: Path) -> list[Path]:
+    """An NRRD and a segmentation of 3D Slicer, whose header's fields and names name the patient."""
+    ct, labels = body(spacing=(4.0, 4.0, 4.0))
+    folder = folder / "Wolpertinger"
+    folder.mkdir()
+    for image in (ct, labels):
+        image.SetMetaData("descrip", "Long^Small, X-22-ID, St Elsewhere, calls himself Jim, 19600229")
+    for number, name in enumerate(("kidney of Long Small", "kidney_left", "GTV Wolpertinger"), start=1):
+        labels.SetMetaData(f"Segment{number}_Name", name)
+        labels.SetMetaData(f"Segment{number}_LabelValue", str(number))
+        labels.SetMetaData(f"Segment{number}_Layer", "0")
+    sitk.WriteImage(ct, str(folder / "Ünal.nrrd"))
+    sitk.WriteImage(
+        sitk.Cast(labels, sitk.sitkUInt8), str(folder / "Long^Small.seg.nrrd"), useCompression=True
+    )
+    return [folder / "Ünal.nrrd", folder / "Long^Small.seg.nrrd"]
+
+
+@pytest.mark.parametrize("source", [from_dicom, from_slicer])
+def test_no_file_names_the_patient_and_no_sentence_is_garbled(source, tmp_path, capfd):
+    out = tmp_path / "out"
+    assert main(["import", *map(str, source(tmp_path)), "--side", "left", "--out", str(out)]) == 0
+    terminal = capfd.readouterr().out
+    everything = contents(out)
+    for text in (*TEXTS, *PERSON.values(), "Long", str(tmp_path)):
+        if len(text) > 3:
+            assert not any(each in everything for each in in_any_encoding(text)), text
+    assert "mm long" in terminal or "length" in terminal
+    assert "removed" not in terminal
+
+
+def test_a_name_that_may_be_a_persons_is_shown_in_the_terminal_alone(tmp_path, capfd):
+    out = tmp_path / "out"
+    assert main(["import", *map(str, from_dicom(tmp_path)), "--out", str(out)]) == 0
+    findings = json.loads((out / "import.json").read_text("utf-8"))
+    sentences = [*findings["notes"], *(warning["text"] for warning in findings["warnings"])]
+    assert "“Ünal”" in capfd.readouterr().out
+    assert any("“...”" in sentence for sentence in sentences)
+
+
+@pytest.mark.parametrize(
+    ("name", "is_written"),
+    [
+        ("kidney_left", True), ("Renal mass 2", True), ("BODY", True), ("vertebrae_L1", True), ("GTV_PRV5", True),
+        ("Doe_left", False), ("GTV Doe", False), ("kidney 19600229", False), ("Carter kidney", False), ("Harnisch", False),
+    ],
+)  # fmt: skip
+def test_names_of_structures_alone_are_written(name, is_written):
+    sentence = f"the label {quoted(name)} has 3 ml"
+    assert (public_text(sentence) == sentence) == is_written
+    assert public_text(sentence).startswith("the label “") and public_text(sentence).endswith("” has 3 ml")
+
+
+@pytest.mark.parametrize("name", ["Doe” and “kidney", "“Doe”", "Doe ”” kidney"])
+def test_a_name_with_quotation_marks_cannot_leave_its_own(name):
+    assert "Doe" not in public_text(f"label {quoted(name)}, 3 ml")
