@@ -1,7 +1,7 @@
 """Carry out an import request: find CT and labels, combine them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
@@ -13,7 +13,9 @@ from scenes.patients.patient_position import Position
 from scenes.patients.readers.ct_series import ct_candidates, open_ct, read_dicom_headers
 from scenes.patients.readers.dicom_headers import DicomContents, Series
 from scenes.patients.readers.label_files import Segmentation, open_labels, segmentation_of
-from scenes.patients.readers.label_maps import absent_labels, assign_tissues, merge_label_maps
+from scenes.patients.readers.label_maps import LabelMap
+from scenes.patients.readers.label_merge import merge_label_maps
+from scenes.patients.readers.segment_choice import absent_labels, assign_tissues, choose_segments, with_commas
 from scenes.patients.readers.segment_names import Side
 from scenes.patients.readers.series_choice import choose_series
 from scenes.patients.readers.volume_folder import volume_files
@@ -22,6 +24,17 @@ from scenes.terminal import Progress, silent
 from scenes.volumes.dicom_references import NO_REFERENCES, DicomReferences, doubts, mismatch
 from scenes.volumes.lazy_volume import LazyVolume
 from scenes.volumes.volume_files import is_volume_file
+
+
+@dataclass(frozen=True)
+class OrganLabels:
+    """The labels of a request, merged."""
+
+    merged: LabelMap
+    own: list[int] | None = None  # values of the organ that the user named
+    drawn: tuple[LabelMap, ...] = ()  # before they were merged, which covers some of them
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def import_request(
@@ -53,47 +66,62 @@ def import_request(
     if not ct.exists():
         raise PatientError(f"{ct}: no such file or folder; check the path")
     tissues = tissues or {}
-    segmentations: list[Segmentation] = []
-    absent: tuple[str, ...] = ()
-    no_tumour: tuple[str, ...] = ()
     if seed_mm is None:
         contents = None if ct.is_file() and is_volume_file(ct) else read_dicom_headers(ct, progress)
         words = [*organ, *chain(*tissues.values())]
         segmentations = _segmentations(ct, contents, labels, series, words, progress)
         volume = volume_of_labels(ct, segmentations, series, progress, contents)
-        maps = [one for segmentation in segmentations for one in segmentation.maps(volume.grid)]
-        empty = [segment for segmentation in segmentations for segment in segmentation.empty]
-        merged = merge_label_maps(assign_tissues(maps, organ, tissues, empty))
-        tumour = {tissue: words for tissue, words in tissues.items() if tissue == "tumour"}
-        no_tumour = tuple(f"{text}; the labels are {merged.listed()}" for text in absent_labels(maps, tumour))
-        absent = absent_labels(
-            maps, {tissue: words for tissue, words in tissues.items() if tissue not in tumour}
-        )
+        of_organ = organ_labels(segmentations, volume, organ, tissues)
     elif labels or organ or tissues:
         raise PatientError(
             "--seed segments the organ where there are no labels: give it, or labels, not both"
         )
     else:
         volume = open_ct(ct, series, progress=progress)
-        merged = draft_segmentation(volume, seed_mm)
-    own = merged.values_of(organ) if organ else None
+        of_organ = OrganLabels(draft_segmentation(volume, seed_mm))
     patient = import_patient(
         volume,
-        merged,
-        own,
+        of_organ.merged,
+        of_organ.own,
         side,
         support=support,
         given=tissues,
+        drawn=of_organ.drawn,
         position=position,
         progress=progress,
     )
-    # Several files of one kind have the same note.
-    notes = dict.fromkeys(note for segmentation in segmentations for note in segmentation.notes)
     return replace(
         patient,
-        notes=(*patient.notes, *notes, *absent),
-        warnings=(*patient.warnings, *no_tumour),
+        notes=(*patient.notes, *of_organ.notes),
+        warnings=(*patient.warnings, *of_organ.warnings),
         draft=seed_mm is not None,
+    )
+
+
+def organ_labels(
+    segmentations: Sequence[Segmentation],
+    volume: LazyVolume,
+    organ: Sequence[str],
+    tissues: Mapping[str, Sequence[str]],
+) -> OrganLabels:
+    """The labels of all sources on a CT, with the tissues that the user assigned by names or values. Raises PatientError."""
+    maps = [one for segmentation in segmentations for one in segmentation.maps(volume.grid)]
+    empty = [segment for segmentation in segmentations for segment in segmentation.empty]
+    organ = with_commas(organ, maps, empty)
+    tissues = {tissue: with_commas(words, maps, empty) for tissue, words in tissues.items()}
+    assigned = assign_tissues(maps, organ, tissues, empty)
+    drawn, notes_of_choice = choose_segments(assigned, [*organ, *chain(*tissues.values())], bool(organ))
+    merged, own = merge_label_maps(drawn, organ)
+    absent = {tissue: absent_labels(maps, {tissue: words}) for tissue, words in tissues.items()}
+    no_tumour = [f"{text}; the labels are {merged.listed()}" for text in absent.pop("tumour", ())]
+    # Several files of one kind have the same note.
+    notes = dict.fromkeys(note for segmentation in segmentations for note in segmentation.notes)
+    return OrganLabels(
+        merged=merged,
+        own=own,
+        drawn=tuple(drawn),
+        notes=(*notes, *notes_of_choice, *chain(*absent.values())),
+        warnings=tuple(no_tumour),
     )
 
 

@@ -1,5 +1,7 @@
 """Warnings of an import: what looks wrong in a CT and its labels, or was assumed."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy import ndimage
 
@@ -16,7 +18,9 @@ AHEAD_MM = 10.0
 LIVER_LEFT_MM = 15.0
 # The outer shell of a correct label contains little fat; the sinus is deeper.
 SHELL_MM, FAT_BELOW_HU, MOST_FAT = 4.0, -60, 0.05
-LEAST_LEFT_OUT_ML = 0.5
+# A segment touches an organ that is so many voxels away, and is in it with this share; beside it, less volume gives no warning.
+REACH, LEAST_WITHIN, LEAST_BESIDE_ML = 2, 0.5, 0.5
+MOST_PLACES = 100_000
 # Above this ``ultrasound.acoustics`` takes parenchyma for stone; less volume gives no warning.
 STONE_ABOVE_MEDIAN_HU, LEAST_STONE_ML = 130.0, 0.1
 
@@ -107,8 +111,17 @@ def _largest_piece(grid: VoxelGrid, bright: np.ndarray, organ: np.ndarray) -> st
     return f"the largest piece {piece.sum() * grid.voxel_ml:.1f} ml in the {third} third, at {x:.0f}, {y:.0f}, {z:.0f} mm (LPS)"
 
 
-def label_warnings(labels: LabelMap, piece: Organ, is_named: bool) -> tuple[str, ...]:
-    """Warnings of labels without a known tissue: taken as the organ, or left out though they touch it."""
+def label_warnings(
+    labels: LabelMap, piece: Organ, is_named: bool, drawn: Sequence[LabelMap]
+) -> tuple[str, ...]:
+    """Warnings of labels without a known tissue: taken as the organ, or left out though they are in it or touch it.
+
+    Args:
+        labels: of the organ.
+        piece: the organ.
+        is_named: whether the user named its labels.
+        drawn: the label maps before they were merged.
+    """
     found = []
     unnamed = [value for value in piece.present if not labels.segments[value].name]
     if not is_named and len(unnamed) > 1:
@@ -116,14 +129,46 @@ def label_warnings(labels: LabelMap, piece: Organ, is_named: bool) -> tuple[str,
         found.append(
             f"labels {names} have no names, and were all taken as the kidney; if they are not, give --organ, --tumour, --cyst"
         )
-    around = ndimage.binary_dilation(piece.mask, iterations=2) & ~piece.mask
-    unknown = {v for v, s in labels.segments.items() if s.tissue is None and not s.is_understood}
-    beside = [v for v in np.unique(piece.values[around]).tolist() if v in unknown]
-    left_out = [(v, float((labels.values == v).sum()) * labels.grid.voxel_ml) for v in beside]
-    shown = [f"{labels.segments[v]} ({ml:.1f} ml)" for v, ml in left_out if ml >= LEAST_LEFT_OUT_ML]
-    if shown:
-        found.append(
-            f"labels beside the organ have no known tissue, and were left out: {listed(shown)}; if one is the patient's tumour or cyst, "
-            "give --tumour or --cyst"
-        )
+    taken = [labels.segments[value] for value in piece.present]
+    near = ndimage.binary_dilation(np.pad(piece.mask, REACH), iterations=REACH)
+    for one in drawn:
+        for value, segment in one.segments.items():
+            if segment.tissue is None and not segment.is_understood and segment not in taken:
+                found += _unknown_segment(one, value, piece, near)
     return tuple(found)
+
+
+def _unknown_segment(one: LabelMap, value: int, piece: Organ, near: np.ndarray) -> list[str]:
+    """A warning of a segment whose tissue is not known, where it is in an organ or touches it.
+
+    ``near`` is the organ, dilated by REACH voxels.
+    """
+    indices = np.argwhere(one.values == value)[:, ::-1]
+    volume_ml = len(indices) * one.grid.voxel_ml
+    places = one.grid.place(indices[:: max(1, len(indices) // MOST_PLACES)])
+    share = _share_in(near, piece.grid.index(places) + REACH)
+    what = f"label {one.segments[value]} ({volume_ml:.1f} ml)"
+    advice = "if it is the patient's tumour or cyst, give --tumour or --cyst with its name or value"
+    if share >= LEAST_WITHIN:
+        return [
+            f"{what} in the organ has no known tissue, and is not shown, {_place(piece, places)}; {advice}"
+        ]
+    if share == 0 or volume_ml < LEAST_BESIDE_ML:
+        return []
+    return [f"{what} touches the organ and has no known tissue, and was left out; {advice}"]
+
+
+def _share_in(mask: np.ndarray, indices: np.ndarray) -> float:
+    """The share of places, as voxel indices (n, 3) with fractions, in a mask (z, y, x)."""
+    at = np.rint(indices).astype(int)
+    at = at[((at >= 0) & (at < mask.shape[::-1])).all(axis=1)]
+    return float(mask[tuple(at.T[::-1])].sum() / max(1, len(indices)))
+
+
+def _place(piece: Organ, places: np.ndarray) -> str:
+    """Where the middle of some places (n, 3), LPS [mm], of an organ is, in words."""
+    x, y, z = places.mean(axis=0)
+    heights = piece.grid.corners()[:, 2]
+    share = (z - heights.min()) / max(float(np.ptp(heights)), 1e-9)
+    third = ("lower", "middle", "upper")[int(np.clip(3 * share, 0, 2))]
+    return f"in the {third} third, at {x:.0f}, {y:.0f}, {z:.0f} mm (LPS)"

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import ndimage
 
 from errors import PatientError
-from scenes.patients.readers.label_maps import LabelMap, among, box_of, listed
+from scenes.patients.readers.label_maps import LESIONS, LabelMap, among, box_of, listed
 from scenes.patients.readers.segment_names import Side
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -21,7 +21,6 @@ COARSE_MM = 4.0
 # Vessels and the collecting system belong to the organ inside hollows of it no wider than twice this.
 CLOSING_MM = 10.0
 PARENCHYMA = ("kidney", "cortex", "medulla", "sinus", "stone")
-LESIONS = ("tumour", "cyst", "necrosis")  # part of the organ, also where they protrude
 VESSELS = ("vessel", "vein", "artery")
 HILAR = (*VESSELS, "urine", "fat")
 

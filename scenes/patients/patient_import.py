@@ -91,6 +91,7 @@ def import_patient(
     margin_mm: float = 60.0,
     support: str = "mould",
     given: Collection[str] = (),
+    drawn: Sequence[LabelMap] = (),
     position: Position | None = None,
     progress: Progress = silent,
 ) -> Patient:
@@ -105,6 +106,7 @@ def import_patient(
         margin_mm: CT kept around the organ [mm].
         support: what the organ rests on: a "mould" of its underside, a bed of the surrounding "labels", or a surface file.
         given: tissues whose labels the user named: a note tells which of them this organ does not have.
+        drawn: the label maps before they were merged: some segments may be covered in ``labels``; none: they are ``labels``.
         position: how the patient lay in the CT; None: as in its header, else supine.
         progress: shows the progress of the surfaces.
 
@@ -130,7 +132,7 @@ def import_patient(
         *position_warnings(overview, actual_position),
         *orientation_warnings(level, level_hu, labels, midline),
         *_tissue_warnings(piece, grid, hounsfield, on_ct, coded, tissues),
-        *label_warnings(labels, piece, organ is not None),
+        *label_warnings(labels, piece, organ is not None, drawn or [labels]),
     )
     found = part_masks(labels, piece)
     part_notes, part_warnings = parts_elsewhere(labels, piece, pieces, found, given)

@@ -13,7 +13,8 @@ import scenes.patients.patient_import
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_files import open_labels
-from scenes.patients.readers.label_maps import assign_tissues, merge_label_maps
+from scenes.patients.readers.label_merge import merge_label_maps
+from scenes.patients.readers.segment_choice import assign_tissues
 
 # Axes of the voxels along the patient's in any order and sense, 48 in all, half of them left-handed.
 PERMUTED = [
@@ -63,7 +64,9 @@ def test_the_surface_lies_where_the_label_is(tmp_path_factory, ct_grid, label_gr
     labels = drawn(label_grid, (1, own))
     for name, image in (("ct", drawn(ct_grid, (40, BODY), (120, LEFT), (120, RIGHT))), ("label", labels)):
         write(image, folder / f"{name}{ending}")
-    label_map = merge_label_maps(assign_tissues(open_labels(folder / f"label{ending}").maps(None), ["1"], {}))
+    label_map, _ = merge_label_maps(
+        assign_tissues(open_labels(folder / f"label{ending}").maps(None), ["1"], {})
+    )
 
     patient = import_patient(
         open_ct(folder / f"ct{ending}"), label_map, label_map.values_of(["1"]), margin_mm=5.0

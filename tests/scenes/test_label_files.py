@@ -8,7 +8,9 @@ from synthetic_body import DIRECTIONS, drawn, grid_around
 from test_readers_labels import KIDNEY, by_name, ct_grid, ring
 
 from scenes.patients.readers.label_files import open_labels
-from scenes.patients.readers.label_maps import LabelMap, assign_tissues, merge_label_maps
+from scenes.patients.readers.label_maps import LabelMap
+from scenes.patients.readers.label_merge import merge_label_maps
+from scenes.patients.readers.segment_choice import assign_tissues
 from scenes.patients.readers.segment_names import side_of
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -41,7 +43,7 @@ class TestTogether:
         inside = np.zeros(GRID.size[::-1], np.uint8)
         inside[2:6, 2:6, 2:6] = 1
         maps = [LabelMap.valued(GRID, inside, {1: name}) for name in (over, under)]
-        for one in (merge_label_maps(maps), merge_label_maps(maps[::-1])):
+        for one in (merge_label_maps(maps)[0], merge_label_maps(maps[::-1])[0]):
             assert [s.name for s in one.segments.values()] == [over] and len(one.segments) == 1
 
     def test_many_values(self):
@@ -60,7 +62,7 @@ class TestTogether:
             LabelMap.valued(grid, np.ones(grid.size[::-1], np.uint8), {1: name})
             for grid, name in ((fine, "kidney"), (coarse, "mass"))
         ]
-        one = merge_label_maps(maps)
+        one, _ = merge_label_maps(maps)
         assert np.isin(one.values, one.of_tissues("tumour")).sum() == pytest.approx(24 * 120, rel=0.03)
 
 

@@ -179,7 +179,9 @@ class TestSegments:
         path = write_segmentation(tmp_path / "seg.dcm", series, {"Kidney": ones, "heart": ones, "body": ones})
         drawing = open_labels(path)
         assert set(by_name(drawing.maps(None))) == {"Kidney"} and drawing.empty == ()
-        assert drawing.notes == ("not read, as they are far from the kidneys or no organ: 2 “heart”, 3 “body”",)
+        assert drawing.notes == (
+            "not read, as they are far from the kidneys or no organ: 2 “heart”, 3 “body”",
+        )
         assert set(by_name(open_labels(path, ["3"]).maps(None))) == {"Kidney", "body"}
 
 

@@ -31,7 +31,8 @@ from scenes.patients.organ_selection import choose_organ, find_organs, midline_x
 from scenes.patients.patient_folder import save_patient
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.ct_series import open_ct
-from scenes.patients.readers.label_maps import LabelMap, absent_labels, assign_tissues
+from scenes.patients.readers.label_maps import LabelMap
+from scenes.patients.readers.segment_choice import absent_labels, assign_tissues
 from scenes.phantom import embedded_patient
 from scenes.scene import SceneError
 from scenes.volumes.lazy_volume import LazyVolume

@@ -15,7 +15,9 @@ from synthetic_body import DIRECTIONS, drawn, grid_around, level
 from errors import PatientError
 from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_files import open_labels
-from scenes.patients.readers.label_maps import LabelMap, Segment, assign_tissues, merge_label_maps
+from scenes.patients.readers.label_maps import LabelMap, Segment
+from scenes.patients.readers.label_merge import merge_label_maps
+from scenes.patients.readers.segment_choice import assign_tissues
 from scenes.patients.readers.segment_names import is_far, side_of, tissue_of
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -373,7 +375,7 @@ class TestTogether:
     def test_tumour_wins(self):
         """Nearest neighbour moves a border by half a voxel's diagonal at most."""
         mass, kidney = self.maps()
-        one = merge_label_maps([mass, kidney])
+        one, _ = merge_label_maps([mass, kidney])
         np.testing.assert_allclose(one.grid.spacing, kidney.grid.spacing)
         index = np.argwhere(np.ones(one.values.shape, bool))[:, ::-1]
         places, values = one.grid.place(index), one.values.ravel()

@@ -182,4 +182,4 @@ def test_coded_segments_beside_the_organ_are_known(tmp_path):
         one = LabelMap(plain.grid, plain.values, {**plain.segments, 3: known})
         piece = find_organs(one, [2])[0]
         assert piece.centre_x_mm == pytest.approx(LEFT[0][0], abs=3)
-        assert len(label_warnings(one, piece, True)) == warned
+        assert len(label_warnings(one, piece, True, [one])) == warned

@@ -1,8 +1,8 @@
-"""Label maps: the segment of each value, tissues assigned by the user, several maps merged into one."""
+"""Label maps: the voxels of one source, and the segment of each value."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,8 +23,8 @@ from scenes.patients.readers.segment_names import (
 from scenes.volumes.dicom_references import NO_REFERENCES, DicomReferences
 from scenes.volumes.voxel_grid import Box, VoxelGrid
 
-# Of overlapping segments, later tissues cover earlier ones: small structures cover their surroundings.
-MERGE_ORDER = (None, "fat", "muscle", "bone", "liver", "kidney", "cortex", "medulla", "sinus", "vessel", "vein", "artery", "urine", "cyst", "tumour", "necrosis", "stone")  # fmt: skip
+# Part of the organ, also where they protrude.
+LESIONS = ("tumour", "cyst", "necrosis")
 # Of other structures only what is this near to a kidney is read; an import keeps 60 mm around its organ.
 NEAR_MM = 80.0
 
@@ -167,96 +167,6 @@ def whole_numbers(voxels: np.ndarray, name: str) -> np.ndarray:
     return voxels.astype(np.uint8 if high < 256 else np.uint16)
 
 
-def assign_tissues(
-    maps: list[LabelMap],
-    organ: Sequence[str],
-    chosen: Mapping[str, Sequence[str]],
-    empty: Sequence[Segment] = (),
-) -> list[LabelMap]:
-    """The maps with the tissues that the user assigned, by names or values.
-
-    A label given as the organ and as a tissue is the tissue. A tissue's value, or its segment in ``empty``, may be absent
-    (``absent_labels``), so that one command is right for many patients.
-
-    Args:
-        maps: all label maps.
-        organ: segments of the organ; those without a tissue become kidney.
-        chosen: tissue -> all of its segments.
-        empty: segments of the files that no voxel has.
-
-    Raises:
-        PatientError: an absent label of the organ, a name that no segment has, or one segment given as two tissues.
-    """
-    segments = _segments(maps)
-    has_values = any(segment.value is not None for segment in segments)
-    of_tissues = {word for words in chosen.values() for word in words}
-    for option, words in {"organ": [word for word in organ if word not in of_tissues], **chosen}.items():
-        for word in words:
-            may_be_absent = option != "organ" and (
-                (has_values and word.isdecimal()) or _is_among(empty, word)
-            )
-            if not may_be_absent and not _is_among(segments, word):
-                raise PatientError(
-                    f"the {_in_words(option)}'s label {word} is not in the label map: it has {listed([str(s) for s in segments])}; "
-                    "give one of these"
-                )
-
-    def assigned(segment: Segment) -> Segment:
-        found = [tissue for tissue, words in chosen.items() if any(segment.matches(word) for word in words)]
-        if len(found) > 1:
-            raise PatientError(
-                f"label {segment} is given as {' and as '.join(map(_in_words, found))}: give it as one of them"
-            )
-        if found:
-            return replace(segment, tissue=found[0])
-        if segment.tissue in chosen:
-            segment = replace(segment, tissue=None)
-        is_organ = any(segment.matches(word) for word in organ)
-        return replace(segment, tissue=segment.tissue or "kidney") if is_organ else segment
-
-    return [replace(one, segments={v: assigned(s) for v, s in one.segments.items()}) for one in maps]
-
-
-def absent_labels(maps: list[LabelMap], chosen: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    """A note for each label of a tissue (tissue -> names or values of its labels) that no voxel has."""
-    segments = _segments(maps)
-    return tuple(
-        f"no voxel has the {_in_words(tissue)}'s label {word}"
-        for tissue, words in chosen.items()
-        for word in words
-        if not _is_among(segments, word)
-    )
-
-
-def _in_words(tissue: str) -> str:
-    """A tissue as the options of an import name it."""
-    return "collecting system" if tissue == "urine" else tissue
-
-
-def _segments(maps: list[LabelMap]) -> list[Segment]:
-    return [segment for one in maps for segment in one.segments.values()]
-
-
-def _is_among(segments: Sequence[Segment], word: str) -> bool:
-    return any(segment.matches(word) for segment in segments)
-
-
-def merge_label_maps(maps: list[LabelMap]) -> LabelMap:
-    """Merge maps that may overlap and have different grids, on the grid of the first with a kidney, extended to cover all."""
-    if len(maps) == 1:
-        return maps[0]
-    main = next((one for one in maps if one.of_tissues("kidney")), maps[0])
-    grid = _extended(main.grid, maps)
-    pieces = [(one, value, segment) for one in maps for value, segment in one.segments.items()]
-    pieces.sort(key=lambda piece: MERGE_ORDER.index(piece[2].tissue))
-    values = np.zeros(grid.size[::-1], np.uint8 if len(pieces) < 256 else np.uint16)
-    for code, (one, value, _) in enumerate(pieces, start=1):
-        inside, box = _onto(grid, one.grid, one.values == value)
-        values[box[::-1]][inside] = code
-    left = set(present_values(values))
-    return LabelMap(grid, values, {n: piece[2] for n, piece in enumerate(pieces, start=1) if n in left})
-
-
 def present_values(values: np.ndarray) -> list[int]:
     """The non-zero values that occur; plane by plane, as np.unique takes eight times the memory."""
     there = np.zeros(1 + np.iinfo(values.dtype).max, bool)
@@ -285,24 +195,3 @@ def resample_nearest(grid: VoxelGrid, voxels: np.ndarray, onto: VoxelGrid) -> np
         return voxels
     image = grid.image(voxels.astype(np.uint8) if voxels.dtype == bool else voxels)
     return onto.sampled(image, sitk.sitkNearestNeighbor, 0).astype(voxels.dtype)
-
-
-def _extended(grid: VoxelGrid, maps: Iterable[LabelMap]) -> VoxelGrid:
-    """A grid extended to cover all maps."""
-    places = np.concatenate([grid.index(one.grid.corners()) for one in maps])
-    low = np.floor(places.min(axis=0) + 1e-3).astype(int)
-    high = np.ceil(places.max(axis=0) - 1e-3).astype(int)
-    extended = replace(grid, size=tuple((high - low + 1).tolist()), origin=grid.place(low))
-    return extended.checked("the labels")
-
-
-def _onto(grid: VoxelGrid, own: VoxelGrid, inside: np.ndarray) -> tuple[np.ndarray, Box]:
-    """A mask on a grid that covers its own, by nearest neighbour, and its box there."""
-    start = np.rint(grid.index(own.origin)).astype(int)
-    x, y, z = (slice(int(a), int(a) + n) for a, n in zip(start, own.size, strict=True))
-    if grid.part((x, y, z)).same_as(own):
-        return inside, (x, y, z)
-    reach = 0.5 * np.abs(own.direction) @ own.spacing
-    low, high = own.bounds()
-    box = grid.box_around(low - reach, high + reach)
-    return resample_nearest(own, inside, grid.part(box)), box

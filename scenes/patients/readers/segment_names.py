@@ -44,7 +44,7 @@ OUTLINE = (
 # Structures that are derived from others by a margin or for the planning of a treatment, as TG-263 (doi 10.1016/j.ijrobp.2017.12.013) and
 # its users name them: PRV, CTV, PTV, ITV, a "z" before the name for optimisation, "~" for a part. A GTV is the tumour itself.
 DERIVED = (
-    r"\b(prv|i?[cp]tv|itv|igtv)|\bring\b|\bopt(i|im|imi[sz]\w+)?\b|\bmargins?\b|\bbbox\b|bounding box|\bexp\b|\bexp(and|ans)\w+|\bdilat\w+|"
+    r"\b(prv|(i ?)?[cp]tv|itv|i ?gtv)|\bring\b|\bopt(i|im|imi[sz]\w+)?\b|\bmargins?\b|\bbbox\b|bounding box|\bexp\b|\bexp(and|ans)\w+|\bdilat\w+|"
     r"\bero(ded|sion)\b|\bshell\b|\bhull\b|\bhalo\b|\bavoid(ance)?\b|\beval\b|\bcropp?(ed)?\b|\bminus\b|\bsubtract\w*|\bwithout\b|\bexcl(uding)?\b|"
     r"\bohne\b|\bsans\b|\b(iso)?dose\b|\bnormal tissue\b"
 )

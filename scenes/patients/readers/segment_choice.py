@@ -1,0 +1,185 @@
+"""Which segments are which tissue: by the user's words, by their names, and not at all where a name is of a derived structure."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+
+from errors import PatientError
+from scenes.patients.readers.label_maps import LESIONS, LabelMap, Segment, listed, resample_nearest
+from scenes.patients.readers.segment_names import is_derived, is_public, quoted
+
+# Segments of one tissue with this share of the smaller in common are the same structure, drawn twice.
+SAME_STRUCTURE = 0.5
+
+
+def assign_tissues(
+    maps: list[LabelMap],
+    organ: Sequence[str],
+    chosen: Mapping[str, Sequence[str]],
+    empty: Sequence[Segment] = (),
+) -> list[LabelMap]:
+    """The maps with the tissues that the user assigned, by names or values.
+
+    A label given as the organ and as a tissue is the tissue. A tissue's value, or its segment in ``empty``, may be absent
+    (``absent_labels``), so that one command is right for many patients.
+
+    Args:
+        maps: all label maps.
+        organ: segments of the organ; those without a tissue become kidney.
+        chosen: tissue -> all of its segments.
+        empty: segments of the files that no voxel has.
+
+    Raises:
+        PatientError: an absent label of the organ, a name that no segment has, or one segment given as two tissues.
+    """
+    segments = _segments(maps)
+    has_values = any(segment.value is not None for segment in segments)
+    of_tissues = {word for words in chosen.values() for word in words}
+    for option, words in {"organ": [word for word in organ if word not in of_tissues], **chosen}.items():
+        for word in words:
+            may_be_absent = option != "organ" and (
+                (has_values and word.isdecimal()) or _is_among(empty, word)
+            )
+            if not may_be_absent and not _is_among(segments, word):
+                raise PatientError(
+                    f"the {_in_words(option)}'s label {word} is not in the label map: it has {listed([str(s) for s in segments])}; "
+                    "give one of these"
+                )
+
+    def assigned(segment: Segment) -> Segment:
+        found = [tissue for tissue, words in chosen.items() if any(segment.matches(word) for word in words)]
+        if len(found) > 1:
+            raise PatientError(
+                f"label {segment} is given as {' and as '.join(map(_in_words, found))}: give it as one of them"
+            )
+        if found:
+            return replace(segment, tissue=found[0])
+        if segment.tissue in chosen:
+            segment = replace(segment, tissue=None)
+        is_organ = any(segment.matches(word) for word in organ)
+        return replace(segment, tissue=segment.tissue or "kidney") if is_organ else segment
+
+    return [replace(one, segments={v: assigned(s) for v, s in one.segments.items()}) for one in maps]
+
+
+def absent_labels(maps: list[LabelMap], chosen: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
+    """A note for each label of a tissue (tissue -> names or values of its labels) that no voxel has."""
+    segments = _segments(maps)
+    return tuple(
+        f"no voxel has the {_in_words(tissue)}'s label {word if word.isdecimal() else quoted(word)}"
+        for tissue, words in chosen.items()
+        for word in words
+        if not _is_among(segments, word)
+    )
+
+
+def _in_words(tissue: str) -> str:
+    """A tissue as the options of an import name it."""
+    return "collecting system" if tissue == "urine" else tissue
+
+
+def _segments(maps: list[LabelMap]) -> list[Segment]:
+    return [segment for one in maps for segment in one.segments.values()]
+
+
+def _is_among(segments: Sequence[Segment], word: str) -> bool:
+    return any(segment.matches(word) for segment in segments)
+
+
+def choose_segments(
+    maps: list[LabelMap], words: Collection[str] = (), is_organ_named: bool = False
+) -> tuple[list[LabelMap], tuple[str, ...]]:
+    """The maps without segments that are no organ, and notes that name these.
+
+    Derived structures are left out, and so is a kidney that is drawn a second time under a longer name. Other segments that are one
+    structure drawn twice, such as two observers', are united when the maps are merged: a note names them.
+
+    Args:
+        maps: with the tissues that the user assigned.
+        words: names or values of segments that the user gave: these are never left out.
+        is_organ_named: whether the user named the organ: then that is the kidney, and no other is.
+
+    Raises:
+        PatientError: nothing else is there.
+    """
+    derived = [
+        segment
+        for segment in _segments(maps)
+        if is_derived(segment.name) and not any(segment.matches(word) for word in words)
+    ]
+    copies, united = _drawn_twice(maps, words, is_organ_named)
+    notes = []
+    if derived:
+        notes.append(
+            f"left out, as derived from other structures: {_listed(derived)}; --organ or --tumour with its name takes one"
+        )
+    if copies:
+        notes.append(
+            f"left out, as the kidney is there under a plain name: {_listed(copies)}; --organ takes one"
+        )
+    notes += [f"united, as they are one structure drawn twice: {_listed(pair)}" for pair in united]
+    kept = _without(maps, [*derived, *copies])
+    if not kept:
+        raise PatientError(
+            f"the labels are only of structures that were derived from others: {_listed(derived)}; expected a kidney; choose other labels, "
+            "or name the kidney's with --organ"
+        )
+    return kept, tuple(notes)
+
+
+def _listed(segments: Sequence[Segment]) -> str:
+    return listed([str(segment) for segment in segments])
+
+
+def _drawn_twice(
+    maps: list[LabelMap], words: Collection[str], is_organ_named: bool
+) -> tuple[list[Segment], list[tuple[Segment, Segment]]]:
+    """Kidneys under a longer name where one with a plain name covers them, and pairs of other segments of one structure."""
+    copies, united = [], []
+    tissues = (*LESIONS, *(("kidney",) * (not is_organ_named)))
+    pieces = [(one, v, s) for one in maps for v, s in one.segments.items() if s.tissue in tissues]
+    for (one, value, first), (other, other_value, second) in combinations(pieces, 2):
+        if one is other or first.tissue != second.tissue:
+            continue
+        if _share_in_common(one, value, other, other_value) < SAME_STRUCTURE:
+            continue
+        longer = [s for s in (first, second) if not is_public(s.name) and not any(map(s.matches, words))]
+        if first.tissue == "kidney" and len(longer) == 1:
+            copies += longer
+        else:
+            united.append((first, second))
+    return copies, united
+
+
+def _share_in_common(one: LabelMap, value: int, other: LabelMap, other_value: int) -> float:
+    """The share of the smaller of two segments that both cover."""
+    (low, high), (other_low, other_high) = one.grid.bounds(), other.grid.bounds()
+    if (low > other_high).any() or (other_low > high).any():
+        return 0.0
+    mine = one.values == value
+    theirs = resample_nearest(other.grid, other.values == other_value, one.grid)
+    ml = mine.sum() * one.grid.voxel_ml, (other.values == other_value).sum() * other.grid.voxel_ml
+    return float((mine & theirs).sum() * one.grid.voxel_ml / max(min(ml), 1e-9))
+
+
+def _without(maps: list[LabelMap], left_out: Sequence[Segment]) -> list[LabelMap]:
+    """The maps without those of segments that are left out; beside others in a map, these have no tissue."""
+    kept = []
+    for one in maps:
+        segments = {v: replace(s, tissue=None) if s in left_out else s for v, s in one.segments.items()}
+        if any(segment not in left_out for segment in one.segments.values()):
+            kept.append(replace(one, segments=segments))
+    return kept
+
+
+def with_commas(words: Sequence[str], maps: list[LabelMap], empty: Sequence[Segment] = ()) -> list[str]:
+    """The user's words, which a list was split into at its commas, joined again where a segment's name has commas."""
+    joined = list(words)
+    for segment in [*_segments(maps), *empty]:
+        parts = [part.strip() for part in segment.name.split(",")]
+        for start in range(len(joined) - len(parts) + 1):
+            run = joined[start : start + len(parts)]
+            if len(parts) > 1 and Segment.named(",".join(parts)).matches(",".join(run)):
+                joined[start : start + len(parts)] = [segment.name]
+                break
+    return joined
