@@ -8,6 +8,7 @@ from pydantic import ValidationError
 
 from errors import explained
 from scenes.atomic_files import atomic_write
+from scenes.patient_space import Space
 from scenes.scene import Scene, SceneError
 from scenes.section import Section, Vector3
 from scenes.terminal import shell_command
@@ -47,6 +48,8 @@ class ImportFindings(Section):
     draft: bool
     position: Literal["supine", "prone", "left-decubitus", "right-decubitus"]
     """How the patient lay in the CT."""
+    space: Space | None = None
+    """Where the axes of files point that do not name it, by the user; None where every file names it."""
     extent_mm: Vector3
     """Of the organ: right-left, front-back, foot-head."""
     length_mm: float | None = None

@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import Literal, cast
+from typing import cast
 
 import igl
 import numpy as np
@@ -12,11 +12,11 @@ from trimesh.exchange.stl import export_stl
 
 from errors import PatientError
 from scenes.atomic_files import atomic_write
+from scenes.patient_space import Space, signs_to_lps
 
 # The coordinate system, as 3D Slicer reads it from an STL's header and a PLY's comments.
 SPACE = b"SPACE=LPS"
 SPACE_FIELD = re.compile(r"\bSPACE ?= ?([\w-]+)")
-Space = Literal["LPS", "RAS"]
 STL_HEADER_BYTES = 80
 ENDINGS = (".stl", ".ply", ".obj")
 # Of surfaces that no installed library reads.
@@ -98,8 +98,9 @@ def stated_space(path: Path) -> Space | None:
 
 def in_lps(surface: trimesh.Trimesh, space: Space | None) -> trimesh.Trimesh:
     """A surface of a coordinate system, None for LPS, in LPS; the order of vertices and faces stays."""
-    turn = (-1.0, -1.0, 1.0) if space == "RAS" else (1.0, 1.0, 1.0)
-    return trimesh.Trimesh(surface.vertices * turn, surface.faces, process=False)
+    signs = signs_to_lps(space or "LPS")
+    faces = surface.faces if signs.prod() > 0 else surface.faces[:, ::-1]  # a mirror turns the triangles over
+    return trimesh.Trimesh(surface.vertices * signs, faces, process=False)
 
 
 def save_surface(surface: trimesh.Trimesh, path: Path) -> None:

@@ -17,6 +17,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from scipy.spatial.distance import pdist
 from skimage.color import rgb2lab
 
+from scenes.patient_space import in_words
 from scenes.patients.organ_selection import HILAR
 from scenes.patients.part_surfaces import PARTS, PEDICLE_MM
 from scenes.patients.patient_import import Patient
@@ -99,6 +100,10 @@ def summary_rows(patient: Patient, complexity: Complexity | None = None) -> list
     surface_ml = patient.organ.volume / 1000
     rows = [("DRAFT", DRAFT)] if patient.draft else []
     rows += [("WARNING", line) for line in patient.warnings]
+    if patient.space:
+        rows.append(
+            ("space", f"{patient.space}, as given, of files that do not name it: {in_words(patient.space)}")
+        )
     rows.append(("organ", f"{patient.side} kidney, {volumes['organ']:.1f} ml (surface {surface_ml:.1f})"))
     rows.append(("extent", f"{extent} mm (right-left x front-back x foot-head)"))
     rows.append(("length", f"{patient.length_mm:.0f} mm from pole to pole, without tumours and cysts"))

@@ -8,6 +8,7 @@ import numpy as np
 from errors import PatientError
 from scenes.atomic_files import check_folder
 from scenes.import_findings import FINDINGS_FILE, findings_text
+from scenes.patient_space import SPACES, Space
 from scenes.patients.patient_folder import public, save_patient
 from scenes.patients.patient_position import POSITIONS, Position
 from scenes.patients.readers.segment_names import Side
@@ -57,6 +58,12 @@ LABEL = "Names or values of the labels"
     type=click.Choice(POSITIONS),
     help="How the patient lay in the CT [the CT's header, else supine]; left-decubitus is on the left side.",
 )
+@click.option(
+    "--space",
+    type=click.Choice(SPACES, case_sensitive=False),
+    help="Where +x, +y and +z point in files that do not name it, such as RAS: to the patient's right, front (anterior) and head "
+    "(superior).",
+)
 def import_patient_command(
     ct: Path,
     labels: tuple[Path, ...],
@@ -68,6 +75,7 @@ def import_patient_command(
     seed: str | None,
     support: str,
     position: Position | None,
+    space: Space | None,
     **words: str | None,
 ) -> None:
     """Make a patient's folder from a CT and its LABELS.
@@ -80,7 +88,7 @@ def import_patient_command(
     if lists:
         from scenes.patients.import_listing import listing_text
 
-        click.echo(listing_text(ct, labels, bar))
+        click.echo(listing_text(ct, labels, bar, space))
         return
     if out is None:
         raise click.UsageError("--out: expected a folder to write to, or --list to see what there is")
@@ -95,7 +103,9 @@ def import_patient_command(
     tissues = {TISSUE_OPTIONS[o]: label_words(text, o) for o, text in words.items() if text is not None}
     own = [] if organ is None else label_words(organ, "organ")
     seed_place = None if seed is None else position_mm(seed)
-    patient = import_request(ct, labels, own, tissues, side, series, seed_place, support, position, bar)
+    patient = import_request(
+        ct, labels, own, tissues, side, series, seed_place, support, position, bar, space
+    )
     complexity = complexity_of_patient(patient)
     written = public(patient)
     rows = summary_rows(written, complexity)

@@ -8,6 +8,7 @@ import numpy as np
 from tabulate import tabulate
 
 from errors import PatientError
+from scenes.patient_space import Space
 from scenes.patients.readers.ct_series import CtListing, LabelsRow, SeriesRow, list_ct
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import LabelMap
@@ -21,15 +22,17 @@ MOST_NAMES = 12
 AS_THEY_ARE = VoxelGrid((1, 1, 1), np.ones(3), np.zeros(3), np.eye(3))
 
 
-def listing_text(ct: Path, labels: Sequence[Path] = (), progress: Progress = silent) -> str:
+def listing_text(
+    ct: Path, labels: Sequence[Path] = (), progress: Progress = silent, space: Space | None = None
+) -> str:
     """CT series and labels as tables: without any name, ID or date of the patient, but with the names of files and labels.
 
     Raises PatientError: a path that cannot be read.
     """
-    listed = list_ct(ct, progress)
+    listed = list_ct(ct, progress, space)
     faults = [f"series {_name(row)} cannot be imported: {row.fault}" for row in listed.series if row.fault]
     parts = [_series_table(listed), "\n".join(faults), _labels_table(listed.labels)]
-    parts += [_labels_text(path, progress) for path in labels]
+    parts += [_labels_text(path, progress, space) for path in labels]
     return "\n\n".join(filter(None, parts))
 
 
@@ -68,11 +71,11 @@ def _labels_table(rows: list[LabelsRow]) -> str:
     return "\n".join(lines)
 
 
-def _labels_text(path: Path, progress: Progress) -> str:
+def _labels_text(path: Path, progress: Progress, space: Space | None) -> str:
     """The labels of one path: their segments with volumes; of DICOM, which needs its CT for that, the names."""
     if of_dicom := _dicom_labels(path, progress):
         return of_dicom
-    maps = open_labels(path, progress=progress).maps(AS_THEY_ARE)
+    maps = open_labels(path, progress=progress, space=space).maps(AS_THEY_ARE)
     rows = [row for one in maps for row in _segment_rows(one)]
     return f"{path.name}:\n" + _table(rows, SEGMENT_HEADS, floatfmt=".1f")
 

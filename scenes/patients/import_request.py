@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from errors import PatientError
+from scenes.patient_space import Space
 from scenes.patients.patient_import import Patient, import_patient
 from scenes.patients.patient_position import Position
 from scenes.patients.readers.ct_series import ct_candidates, open_ct, read_dicom_headers
@@ -48,6 +49,7 @@ def import_request(
     support: str = "mould",
     position: Position | None = None,
     progress: Progress = silent,
+    space: Space | None = None,
 ) -> Patient:
     """The imported patient.
 
@@ -59,6 +61,7 @@ def import_request(
         series: number or UID of one of several series.
         seed_mm: (3,) LPS; instead of labels.
         progress: shows the progress of each step.
+        space: of the axes of files that do not name it.
 
     Raises:
         PatientError: what was found, what was expected and what to do.
@@ -69,16 +72,22 @@ def import_request(
     if seed_mm is None:
         contents = None if ct.is_file() and is_volume_file(ct) else read_dicom_headers(ct, progress)
         words = [*organ, *chain(*tissues.values())]
-        segmentations = _segmentations(ct, contents, labels, series, words, progress)
-        volume = volume_of_labels(ct, segmentations, series, progress, contents)
+        segmentations = _segmentations(ct, contents, labels, series, words, progress, space)
+        volume = volume_of_labels(ct, segmentations, series, progress, contents, space)
         of_organ = organ_labels(segmentations, volume, organ, tissues)
+        assumed = any([volume.space, *(each.space for each in segmentations)])
     elif labels or organ or tissues:
         raise PatientError(
             "--seed segments the organ where there are no labels: give it, or labels, not both"
         )
     else:
-        volume = open_ct(ct, series, progress=progress)
+        volume = open_ct(ct, series, progress=progress, space=space)
+        assumed = volume.space is not None
         of_organ = OrganLabels(draft_segmentation(volume, seed_mm))
+    if space is not None and not assumed:
+        raise PatientError(
+            f"--space {space}: every file states where its axes point; leave --space out, or correct the file that states it wrongly"
+        )
     patient = import_patient(
         volume,
         of_organ.merged,
@@ -95,6 +104,7 @@ def import_request(
         notes=(*patient.notes, *of_organ.notes),
         warnings=(*patient.warnings, *of_organ.warnings),
         draft=seed_mm is not None,
+        space=space,
     )
 
 
@@ -132,6 +142,7 @@ def _segmentations(
     series: str | None,
     words: list[str],
     progress: Progress,
+    space: Space | None,
 ) -> list[Segmentation]:
     """The segmentations of the paths, else the one among the DICOM files of the CT."""
     candidates: list[Series] = []
@@ -145,7 +156,7 @@ def _segmentations(
         return not own or any(not mismatch(references, one) for one in own)
 
     if labels:
-        return [open_labels(path, words, progress, belongs) for path in labels]
+        return [open_labels(path, words, progress, belongs, space) for path in labels]
     found = segmentation_of(contents, words, progress, belongs) if contents else None
     if found is None:
         raise PatientError(
@@ -160,11 +171,12 @@ def volume_of_labels(
     series: str | None = None,
     progress: Progress = silent,
     contents: DicomContents | None = None,
+    space: Space | None = None,
 ) -> LazyVolume:
     """The CT that the labels were drawn on. Raises PatientError where they belong to another."""
     labels = next((s.references for s in segmentations if s.references != NO_REFERENCES), NO_REFERENCES)
     grid = next((s.grid for s in segmentations if s.grid), None)
-    volume = open_ct(ct, series, labels, grid, progress, contents)
+    volume = open_ct(ct, series, labels, grid, progress, contents, space)
     for segmentation in segmentations:
         fault = mismatch(segmentation.references, volume.references)
         if fault:

@@ -17,6 +17,7 @@ def findings_of(patient: Patient, complexity: Complexity | None) -> ImportFindin
         side=patient.side,
         draft=patient.draft,
         position=patient.position,
+        space=patient.space,
         extent_mm=_rounded(patient.organ.extents),
         length_mm=round(patient.length_mm, DIGITS),
         surfaces={

@@ -14,6 +14,7 @@ import trimesh
 
 from errors import PatientError
 from scenes.kidney_axes import kidney_axes
+from scenes.patient_space import Space
 from scenes.patients.import_warnings import fat_warnings, label_warnings, orientation_warnings, stone_warnings
 from scenes.patients.kidney_plausibility import kidney_warnings
 from scenes.patients.label_shift import shift_warnings
@@ -71,6 +72,7 @@ class Patient:
     colours: dict[str, Colour] = field(default_factory=dict)  # of organ and parts, where labels have one
     draft: bool = False  # made by region growing
     position: Position = "supine"  # in the CT, which gives gravity
+    space: Space | None = None  # of the axes of files that do not name it, by the user
 
     @property
     def tumour(self) -> trimesh.Trimesh | None:

@@ -9,17 +9,20 @@ import numpy as np
 import SimpleITK as sitk
 
 from errors import PatientError, parsing
-from scenes.volumes.lazy_volume import LazyVolume, check_size, no_scalar
+from scenes.patient_space import Space
+from scenes.volumes.lazy_volume import LazyVolume, check_size, no_orientation, no_scalar
 from scenes.volumes.voxel_grid import Box, VoxelGrid, check_3d
 
 NRRD, META = (".nrrd", ".nhdr"), (".mha", ".mhd")
+# Of MetaImage, as MetaIO reads them.
+ORIENTATION_FIELDS = {"transformmatrix", "rotation", "orientation"}
 HEADER_BYTES, LINE_BYTES, NAME_LETTERS = 1 << 22, 1 << 16, 255
 
 
-def itk_volume(path: Path, vectors: bool = False) -> LazyVolume:
+def itk_volume(path: Path, vectors: bool = False, space: Space | None = None) -> LazyVolume:
     """Read the header of an NRRD or MetaImage file; voxels (z, y, x), of vectors (z, y, x, n), are read on demand.
 
-    Raises PatientError: damaged, not 3D, of several numbers per voxel but for ``vectors``, without a place in the patient.
+    ``space`` is that of a file that names none. Raises PatientError: damaged, not 3D, of several numbers per voxel but for ``vectors``, without a place in the patient.
     """
     data_file = file_with_voxels(path)
     is_nrrd = path.suffix.lower() in NRRD
@@ -29,11 +32,11 @@ def itk_volume(path: Path, vectors: bool = False) -> LazyVolume:
     with parsing(f"{path}: cannot be read as an image", "expected a whole file; copy or export it again"):
         reader.ReadImageInformation()
     check_3d(str(path), reader.GetSize())
-    if is_nrrd and not reader.HasMetaDataKey("NRRD_space"):
-        raise PatientError(
-            f"{path}: has no space field (such as left-posterior-superior), so left and right may be exchanged; export it again"
-        )
-    grid = VoxelGrid.of(reader).checked(str(path))
+    missing = _missing_orientation(path, reader)
+    if missing and space is None:
+        raise no_orientation(path, missing)
+    assumed = space if missing else None
+    grid = VoxelGrid.of(reader).in_lps(assumed or "LPS").checked(str(path))
     kind, components = sitk.GetPixelIDValueAsString(reader.GetPixelID()), reader.GetNumberOfComponents()
     bits = re.search(r"(\d+)-bit", kind)
     voxel_bytes = components * (int(bits[1]) // 8 if bits else 8)
@@ -41,7 +44,20 @@ def itk_volume(path: Path, vectors: bool = False) -> LazyVolume:
     if (components != 1 and not vectors) or "complex" in kind:
         raise no_scalar(path, kind)
     metadata = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys() if key.isprintable()}
-    return LazyVolume(str(path), grid, partial(_itk_box, path), metadata=metadata)
+    return LazyVolume(str(path), grid, partial(_itk_box, path), space=assumed, metadata=metadata)
+
+
+def _missing_orientation(path: Path, reader: sitk.ImageFileReader) -> str:
+    """What a header lacks to say where its axes point in the patient; "" where it lacks nothing."""
+    if path.suffix.lower() in META:
+        is_there = any(key in ORIENTATION_FIELDS for key, _ in _header_fields(path))
+        return "" if is_there else "has no TransformMatrix"
+    if not reader.HasMetaDataKey("NRRD_space"):
+        return "has no space field (such as left-posterior-superior)"
+    # ITK has converted the anatomical ones to this.
+    if (space := reader.GetMetaData("NRRD_space")) != "left-posterior-superior":
+        return f"its space is {space}, which names no axes of the patient (expected such as left-posterior-superior)"
+    return ""
 
 
 def _itk_box(path: Path, box: Box) -> np.ndarray:

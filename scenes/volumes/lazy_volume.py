@@ -11,6 +11,7 @@ import psutil
 import SimpleITK as sitk
 
 from errors import PatientError
+from scenes.patient_space import SPACES, Space
 from scenes.volumes.dicom_references import NO_REFERENCES, DicomReferences
 from scenes.volumes.voxel_grid import Box, VoxelGrid
 
@@ -34,6 +35,7 @@ class LazyVolume:
     notes: tuple[str, ...] = ()  # for the user: what was chosen, left out or resampled
     references: DicomReferences = NO_REFERENCES  # the DICOM objects that it consists of
     series: str = ""  # number of the DICOM series
+    space: Space | None = None  # of the axes, by the user, where the file names none
     patient_position: str = ""  # DICOM's term, such as HFS, where there is one
     # Of a file's header, with the names of its labels.
     metadata: Mapping[str, str] = field(default_factory=dict)
@@ -85,6 +87,14 @@ def check_size(path: Path, grid: VoxelGrid, voxel_bytes: int, held_bytes: int, c
         raise PatientError(
             f"{path}: its header claims {size} voxels, more than the file can hold; copy or export it again"
         )
+
+
+def no_orientation(path: Path, what: str) -> PatientError:
+    """The error for a file that does not say where its axes point in the patient."""
+    return PatientError(
+        f"{path}: {what}, so left and right may be exchanged; export it again with its orientation, for example from 3D Slicer; if you know "
+        f"where its axes point, give --space, one of {', '.join(SPACES)}"
+    )
 
 
 def no_scalar(path: Path, kind: object) -> PatientError:

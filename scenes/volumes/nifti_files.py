@@ -10,7 +10,8 @@ import nibabel
 import numpy as np
 
 from errors import PatientError, parsing
-from scenes.volumes.lazy_volume import LazyVolume, check_size, no_scalar
+from scenes.patient_space import Space
+from scenes.volumes.lazy_volume import LazyVolume, check_size, no_orientation, no_scalar
 from scenes.volumes.voxel_grid import Box, VoxelGrid, check_3d
 
 # Problems are reported as errors here.
@@ -25,8 +26,11 @@ SCANNER_CODE = 1
 RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
 
 
-def nifti_volume(path: Path) -> LazyVolume:
-    """Read the header of a volume; voxels are read on demand. Raises PatientError: damaged, not 3D, sheared, no orientation."""
+def nifti_volume(path: Path, space: Space | None = None) -> LazyVolume:
+    """Read the header of a volume; voxels are read on demand. ``space`` is that of a file without an orientation.
+
+    Raises PatientError: damaged, not 3D, sheared, no orientation.
+    """
     with parsing(f"{path}: cannot be read as NIfTI", "expected a whole file; copy or export it again"):
         image: Any = nibabel.load(path, keep_file_open=True)
         header, shape = image.header, image.shape
@@ -36,7 +40,8 @@ def nifti_volume(path: Path) -> LazyVolume:
     check_3d(str(path), shape)
     if kind.fields or kind.kind not in "iuf":
         raise no_scalar(path, kind)
-    grid = _grid(path, header, shape).checked(str(path))
+    grid, assumed = _grid(path, header, shape, space)
+    grid.checked(str(path))
     check_size(path, grid, kind.itemsize, path.stat().st_size, compressed=path.name.lower().endswith(".gz"))
     last = (0,) * (len(image.shape) - 3)
 
@@ -50,7 +55,7 @@ def nifti_volume(path: Path) -> LazyVolume:
                 planes.append(_narrow(np.asarray(part)).T)
         return np.concatenate(planes)
 
-    return LazyVolume(str(path), grid, read_box, metadata=_label_names(header))
+    return LazyVolume(str(path), grid, read_box, space=assumed, metadata=_label_names(header))
 
 
 def _label_names(header: Any) -> dict[str, str]:
@@ -75,29 +80,34 @@ def _narrow(voxels: np.ndarray) -> np.ndarray:
     return voxels.astype(np.float32)
 
 
-def _grid(path: Path, header: Any, shape: tuple[int, ...]) -> VoxelGrid:
+def _grid(
+    path: Path, header: Any, shape: tuple[int, ...], space: Space | None
+) -> tuple[VoxelGrid, Space | None]:
+    """The grid, and the given space where the header has no orientation."""
     with parsing(f"{path}: its position in the patient cannot be read", "export it again"):
         unit = header.get_xyzt_units()[0]
         forms = (
             (int(header["sform_code"]), header.get_sform()),
             (int(header["qform_code"]), header.get_qform()),
         )
-    affine = _affine(path, [form for form in forms if form[0] > 0], shape)
     scale = MM_OF_UNIT.get(unit, 1.0)
+    size = cast(tuple[int, int, int], tuple(shape))
+    stated = [form for form in forms if form[0] > 0]
+    if not stated and space is None:
+        raise no_orientation(path, "has no orientation (sform and qform codes are 0)")
+    if not stated:
+        zooms = np.array([float(n) for n in header.get_zooms()[:3]]) * scale
+        return VoxelGrid(size, zooms, np.zeros(3), np.eye(3)).in_lps(space or "LPS"), space
+    affine = _affine(path, stated, shape)
     columns = RAS_TO_LPS @ affine[:3, :3] * scale
     spacing = np.linalg.norm(columns, axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         direction = columns / spacing
-    size = cast(tuple[int, int, int], tuple(shape))
-    return VoxelGrid(size, spacing, RAS_TO_LPS @ affine[:3, 3] * scale, direction)
+    return VoxelGrid(size, spacing, RAS_TO_LPS @ affine[:3, 3] * scale, direction), None
 
 
 def _affine(path: Path, forms: list[tuple[int, np.ndarray]], shape: tuple[int, ...]) -> np.ndarray:
     """The affine (4, 4) from indices to RAS, of sform and qform; the scanner's where they disagree."""
-    if not forms:
-        raise PatientError(
-            f"{path}: has no orientation (sform and qform codes are 0), so left and right may be exchanged; export it again with its orientation"
-        )
     affine = forms[0][1]
     corners = np.array(np.meshgrid(*[(0, n - 1) for n in shape], [1])).reshape(4, -1)
     apart = max(np.abs((affine - other) @ corners).max() for _, other in forms)

@@ -6,6 +6,7 @@ from pathlib import Path
 import SimpleITK as sitk
 
 from scenes.atomic_files import atomic_write
+from scenes.patient_space import Space
 from scenes.volumes.itk_files import META, NRRD, itk_volume
 from scenes.volumes.lazy_volume import LazyVolume
 
@@ -18,17 +19,23 @@ def is_volume_file(path: Path) -> bool:
     return path.name.lower().endswith(ENDINGS)
 
 
-def file_volume(path: Path, vectors: bool = False) -> LazyVolume:
-    """Read the header of a volume file; voxels are read on demand. Raises PatientError: damaged, not 3D, sheared, no orientation.
+def file_volume(path: Path, vectors: bool = False, space: Space | None = None) -> LazyVolume:
+    """Read the header of a volume file; voxels are read on demand.
 
-    With ``vectors``, an NRRD or MetaImage may have several numbers per voxel: the layers of a segmentation.
+    Args:
+        path: NIfTI, NRRD or MetaImage.
+        vectors: whether an NRRD or MetaImage may have several numbers per voxel: the layers of a segmentation.
+        space: of the axes of a file that does not name it; a file's own counts before it.
+
+    Raises:
+        PatientError: damaged, not 3D, sheared, or without an orientation where no ``space`` is given.
     """
     if not path.name.lower().endswith(NIFTI):
-        return itk_volume(path, vectors)
+        return itk_volume(path, vectors, space)
     # nibabel takes 0.2 s to import.
     from scenes.volumes.nifti_files import nifti_volume
 
-    return nifti_volume(path)
+    return nifti_volume(path, space)
 
 
 def save_image(image: sitk.Image, path: Path) -> None:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import SimpleITK as sitk
 
 from errors import PatientError
+from scenes.patient_space import Space, signs_to_lps
 
 Box = tuple[slice, slice, slice]
 
@@ -68,6 +69,11 @@ class VoxelGrid:
                 f"{name}: the axes are sheared; expected axes at right angles; resample the volume, for example in 3D Slicer"
             )
         return self
+
+    def in_lps(self, space: Space) -> VoxelGrid:
+        """This grid, whose origin and axes are those of a space, in LPS."""
+        signs = signs_to_lps(space)
+        return replace(self, origin=signs * self.origin, direction=signs[:, None] * self.direction)
 
     def place(self, indices: npt.ArrayLike) -> np.ndarray:
         """LPS [mm] of voxel indices (n, 3) in the order x, y, z."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from errors import PatientError
+from scenes.patient_space import Space
 from scenes.patients.readers.dicom_files import SourceFile, find_dicom_files
 from scenes.patients.readers.dicom_headers import DicomContents, DicomSlice, Series, read_headers
 from scenes.patients.readers.label_headers import label_header
@@ -70,7 +71,7 @@ class CtListing:
     labels: list[LabelsRow]  # by file
 
 
-def list_ct(path: Path, progress: Progress = silent) -> CtListing:
+def list_ct(path: Path, progress: Progress = silent, space: Space | None = None) -> CtListing:
     """The CT series and DICOM labels of a path as for ``open_ct``, from their headers.
 
     A path with labels but without a CT has no series. Raises PatientError: not readable, or neither CT nor labels.
@@ -78,9 +79,9 @@ def list_ct(path: Path, progress: Progress = silent) -> CtListing:
     if not path.exists():
         raise PatientError(f"{path}: no such file or folder; check the path")
     if path.is_file() and is_volume_file(path):
-        return CtListing([_row_of_file(file_volume(path))], [])
+        return CtListing([_row_of_file(file_volume(path, space=space))], [])
     found, volumes = read_dicom_headers(path, progress), volume_files(path)
-    files = [_row_of_file(only_volume(path, volumes))] if volumes and not found.candidates else []
+    files = [_row_of_file(only_volume(path, volumes, space))] if volumes and not found.candidates else []
     candidates = in_order(found.candidates if found.labels or files else ct_candidates(path, found))
     patients = patient_numbers(candidates)
     numbers = [s.number for s in candidates]
@@ -100,6 +101,7 @@ def open_ct(
     grid: VoxelGrid | None = None,
     progress: Progress = silent,
     found: DicomContents | None = None,
+    space: Space | None = None,
 ) -> LazyVolume:
     """Find a CT and read its headers; voxels are read on demand.
 
@@ -111,6 +113,7 @@ def open_ct(
         grid: the labels' own voxels, where they are a label map.
         progress: shows the progress of headers and slices.
         found: the headers of the path, where they have been read.
+        space: of the axes of a file that does not name it.
 
     Raises:
         PatientError: not readable, or not one complete CT.
@@ -120,12 +123,12 @@ def open_ct(
     if path.is_file() and is_volume_file(path):
         if series is not None:
             raise PatientError(f"{path}: has no series; leave --series out")
-        return file_volume(path)
+        return file_volume(path, space=space)
     found, volumes = found or read_dicom_headers(path, progress), volume_files(path)
     if volumes and not found.candidates:
         if series is not None:
             raise PatientError(f"{path}: has no DICOM series; leave --series out")
-        return only_volume(path, volumes)
+        return only_volume(path, volumes, space)
     chosen, notes = choose_series(path, ct_candidates(path, found), series, labels, grid)
     if found.others:
         notes.append(f"left out, no CT slices: {', '.join(_counted(found.others))}")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from errors import PatientError
+from scenes.patient_space import Space
 from scenes.patients.readers.ct_series import read_dicom_headers
 from scenes.patients.readers.dicom_files import find_dicom_files
 from scenes.patients.readers.dicom_headers import DicomContents
@@ -50,6 +51,7 @@ def open_labels(
     wanted: Collection[str] = (),
     progress: Progress = silent,
     belongs: Belongs = lambda references: True,
+    space: Space | None = None,
 ) -> Segmentation:
     """Read labels.
 
@@ -59,6 +61,7 @@ def open_labels(
         wanted: names or values of segments, or files of a folder, to read, whatever their names.
         progress: shows the progress of headers, files and contours.
         belongs: selects one of several DICOM labels.
+        space: of the axes of files that do not name it.
 
     Raises:
         PatientError: not readable, no labels, or all empty.
@@ -66,12 +69,12 @@ def open_labels(
     if not path.exists():
         raise PatientError(f"{path}: no such file or folder; check the path")
     if path.is_file() and is_volume_file(path):
-        return _label_map_file(path)
+        return _label_map_file(path, space)
     if path.is_file() and is_surface_file(path):
-        return read_surfaces([path], NEAR_MM, progress)
+        return read_surfaces([path], NEAR_MM, progress, space)
     if path.suffix.lower() in OTHER_ENDINGS:
         raise PatientError(f"{path}: is a surface that cannot be read here; export it as STL, PLY or OBJ")
-    if of_files := _files_of_folder(path, wanted, progress):
+    if of_files := _files_of_folder(path, wanted, progress, space):
         return of_files
     if not find_dicom_files(path):
         raise PatientError(
@@ -90,15 +93,17 @@ def open_labels(
     return found
 
 
-def _files_of_folder(folder: Path, wanted: Collection[str], progress: Progress) -> Segmentation | None:
+def _files_of_folder(
+    folder: Path, wanted: Collection[str], progress: Progress, space: Space | None
+) -> Segmentation | None:
     """The label maps of a folder, or its surfaces, one per organ; None without either. Raises PatientError."""
     entries = sorted(folder.iterdir()) if folder.is_dir() else []
     surfaces = [file for file in entries if is_surface_file(file)]
     if organ_files := [file for file in entries if is_volume_file(file)]:
         of_maps = (
-            _label_map_file(organ_files[0])
+            _label_map_file(organ_files[0], space)
             if len(organ_files) == 1
-            else _file_per_organ(folder, organ_files, wanted, progress)
+            else _file_per_organ(folder, organ_files, wanted, progress, space)
         )
         note = f"label maps were read, and not the surfaces beside them: {len(surfaces)}"
         return replace(of_maps, notes=(*of_maps.notes, note)) if surfaces else of_maps
@@ -109,7 +114,7 @@ def _files_of_folder(folder: Path, wanted: Collection[str], progress: Progress) 
         raise PatientError(
             f"{folder}: has surfaces far from the kidneys alone; expected a kidney's; choose other labels"
         )
-    return read_surfaces(near, NEAR_MM, progress)
+    return read_surfaces(near, NEAR_MM, progress, space)
 
 
 def segmentation_of(
@@ -136,9 +141,9 @@ def segmentation_of(
     )
 
 
-def _label_map_file(path: Path) -> Segmentation:
+def _label_map_file(path: Path, space: Space | None) -> Segmentation:
     """A label map, or the layers of 3D Slicer's .seg.nrrd; a single label without a name gets the file's."""
-    volume = file_volume(path, vectors=True)
+    volume = file_volume(path, vectors=True, space=space)
     voxels = volume.read()
     layers = [voxels] if voxels.ndim == 3 else np.moveaxis(voxels, -1, 0)
     names = _names(volume)
@@ -164,6 +169,7 @@ def _label_map_file(path: Path) -> Segmentation:
         lambda _: maps,
         grid=volume.grid,
         empty=tuple(unused.values()),
+        space=volume.space,
     )
 
 
@@ -191,7 +197,7 @@ def _names(volume: LazyVolume) -> dict[tuple[int, int], Segment]:
 
 
 def _file_per_organ(
-    folder: Path, files: list[Path], wanted: Collection[str], progress: Progress
+    folder: Path, files: list[Path], wanted: Collection[str], progress: Progress, space: Space | None
 ) -> Segmentation:
     """One mask per organ, as TotalSegmentator writes: the files name the organs, and may be empty."""
     near = _near(files, wanted)
@@ -200,8 +206,10 @@ def _file_per_organ(
     maps: list[LabelMap] = []
     empty: list[Segment] = []
     around: np.ndarray | None = None
+    assumed: Space | None = None
     for file in progress(near, "labels"):
-        volume = file_volume(file)
+        volume = file_volume(file, space=space)
+        assumed = volume.space or assumed
         is_kidney = tissue_of(_stem(file)) == "kidney"
         box = volume.grid.full_box()
         if around is not None and not is_kidney:
@@ -221,7 +229,7 @@ def _file_per_organ(
         raise PatientError(
             f"{folder}: all {len(near)} label files are empty; expected an organ; choose other labels"
         )
-    return Segmentation(lambda _: maps, grid=volume.grid, empty=tuple(empty))
+    return Segmentation(lambda _: maps, grid=volume.grid, empty=tuple(empty), space=assumed)
 
 
 def _near(files: list[Path], wanted: Collection[str]) -> list[Path]:

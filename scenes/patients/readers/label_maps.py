@@ -10,6 +10,7 @@ import SimpleITK as sitk
 from scipy import ndimage
 
 from errors import PatientError
+from scenes.patient_space import Space
 from scenes.patients.readers.segment_codes import CodedMeaning
 from scenes.patients.readers.segment_names import (
     Side,
@@ -135,6 +136,7 @@ class Segmentation:
     references: DicomReferences = NO_REFERENCES  # the DICOM objects that they refer to
     grid: VoxelGrid | None = None  # of label maps: all voxels of the first
     empty: tuple[Segment, ...] = ()  # segments that no voxel has
+    space: Space | None = None  # of the axes, by the user, where a file names none
 
 
 def is_left_out(segment: Segment, wanted: Collection[str], is_tissue: bool = True) -> bool:

@@ -8,8 +8,9 @@ import numpy as np
 import trimesh
 
 from errors import PatientError
+from scenes.patient_space import Space
 from scenes.patients.readers.label_maps import LabelMap, Segment, Segmentation
-from scenes.surfaces import Space, in_lps, read_triangles, stated_space
+from scenes.surfaces import in_lps, read_triangles, stated_space
 from scenes.terminal import Progress
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -30,18 +31,22 @@ LEAST_IN_CT = 0.5
 NAMED_OPENINGS = 3
 
 
-def read_surfaces(files: Sequence[Path], near_mm: float, progress: Progress) -> Segmentation:
+def read_surfaces(
+    files: Sequence[Path], near_mm: float, progress: Progress, space: Space | None = None
+) -> Segmentation:
     """One structure a file, named by the file. Of other structures than kidneys only the part near these is labelled.
 
     Args:
         files: one or more.
         near_mm: how near to a kidney.
         progress: shows the progress of reading.
+        space: of files that state none.
 
     Raises:
         PatientError: no closed surface in mm; later, on the CT's grid: outside the CT, or bodies that cover each other.
     """
-    spaces = {file: stated_space(file) for file in files}
+    stated = {file: stated_space(file) for file in files}
+    spaces = {file: own or space for file, own in stated.items()}
     surfaces = {file: in_lps(_closed(file), spaces[file]) for file in progress(files, "surfaces")}
 
     def maps(ct: VoxelGrid) -> list[LabelMap]:
@@ -61,6 +66,7 @@ def read_surfaces(files: Sequence[Path], near_mm: float, progress: Progress) -> 
     return Segmentation(
         maps,
         notes=(f"surfaces that state no coordinate system were taken as LPS: {assumed}",) if assumed else (),
+        space=space if None in stated.values() else None,
     )
 
 

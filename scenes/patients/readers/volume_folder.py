@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from errors import PatientError
+from scenes.patient_space import Space
 from scenes.patients.readers.label_maps import listed
 from scenes.patients.readers.segment_names import is_understood
 from scenes.volumes.lazy_volume import LazyVolume
@@ -24,7 +25,7 @@ def volume_files(path: Path) -> list[Path]:
     return sorted(file for file in entries if is_volume_file(file) and file.is_file())
 
 
-def only_volume(folder: Path, files: list[Path]) -> LazyVolume:
+def only_volume(folder: Path, files: list[Path], space: Space | None = None) -> LazyVolume:
     """The one volume file of a folder that is not named as labels. Raises PatientError where there are several, or labels alone."""
     images = [file for file in files if not _is_named_as_labels(file)] if len(files) > 1 else files
     if len(images) != 1:
@@ -33,7 +34,7 @@ def only_volume(folder: Path, files: list[Path]) -> LazyVolume:
             f"{folder}: has {len(images) or len(files)} files that may be the CT{'' if images else ', all named as labels'}: {names}; "
             "expected one; give its path as CT"
         )
-    volume = file_volume(images[0])
+    volume = file_volume(images[0], space=space)
     chosen = f"of {len(files)} volume files, the one that is not named as labels was taken as the CT"
     return replace(volume, notes=(*volume.notes, *(chosen,) * (len(files) > 1)))
 
