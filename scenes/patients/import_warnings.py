@@ -5,17 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
-from scenes.patients.organ_selection import BODY_ABOVE_HU, Organ
-from scenes.patients.readers.label_maps import LabelMap, among, box_of, listed
+from scenes.patients.organ_selection import Organ
+from scenes.patients.readers.label_maps import LabelMap, box_of, listed
 from scenes.volumes.voxel_grid import VoxelGrid
 
-BONE_ABOVE_HU = 300
-COARSE_MM = 3.0
-LEAST_BONE_ML = 15.0
-# At the level of the kidneys, the centroid of the bones is posterior to that of the body.
-AHEAD_MM = 10.0
-# The liver's centroid is on the right, though it extends across the midline.
-LIVER_LEFT_MM = 15.0
 # The outer shell of a correct label contains little fat; the sinus is deeper.
 SHELL_MM, FAT_BELOW_HU, MOST_FAT = 4.0, -60, 0.05
 # A segment touches an organ that is so many voxels away, and is in it with this share; beside it, less volume gives no warning.
@@ -23,40 +16,6 @@ REACH, LEAST_WITHIN, LEAST_BESIDE_ML = 2, 0.5, 0.5
 MOST_PLACES = 100_000
 # Above this ``ultrasound.acoustics`` takes parenchyma for stone; less volume gives no warning.
 STONE_ABOVE_MEDIAN_HU, LEAST_STONE_ML = 130.0, 0.1
-
-
-def orientation_warnings(
-    grid: VoxelGrid, hounsfield: np.ndarray, labels: LabelMap, midline: float | None
-) -> tuple[str, ...]:
-    """Warnings of bones in front of the body's centroid, and of a liver on the left.
-
-    ``hounsfield`` (z, y, x) is the CT on ``grid`` at the level of the organs; ``midline`` is LPS x [mm].
-    """
-    found = []
-    if _bones_ahead(grid, hounsfield):
-        found.append(
-            "the bones are in front of the body's centre, not behind it; the CT may be turned over; compare check.png "
-            "with the patient"
-        )
-    liver = among(labels.values, labels.of_tissues("liver"))
-    if midline is not None and liver.any():
-        step = max(1, int(COARSE_MM / labels.grid.spacing.min()))
-        places = labels.grid.place(np.argwhere(liver[::step, ::step, ::step])[:, ::-1] * step)
-        if len(places) and places[:, 0].mean() > midline + LIVER_LEFT_MM:
-            found.append(
-                "the liver is on the patient's left; CT and labels may be mirrored; compare check.png with the patient"
-            )
-    return tuple(found)
-
-
-def _bones_ahead(grid: VoxelGrid, hounsfield: np.ndarray) -> bool:
-    step = np.maximum(1, (COARSE_MM / grid.spacing).astype(int))
-    coarse = hounsfield[:: step[2], :: step[1], :: step[0]]
-    bone, body = coarse > BONE_ABOVE_HU, coarse > BODY_ABOVE_HU
-    if bone.sum() * np.prod(step * grid.spacing) / 1000 < LEAST_BONE_ML:
-        return False
-    bone_y, body_y = (grid.place(np.argwhere(there)[:, ::-1] * step)[:, 1].mean() for there in (bone, body))
-    return bool(bone_y < body_y - AHEAD_MM)
 
 
 def fat_warnings(

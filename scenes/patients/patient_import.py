@@ -15,7 +15,8 @@ import trimesh
 from errors import PatientError
 from scenes.kidney_axes import kidney_axes
 from scenes.patient_space import Space
-from scenes.patients.import_warnings import fat_warnings, label_warnings, orientation_warnings, stone_warnings
+from scenes.patients.body_orientation import orientation_warnings
+from scenes.patients.import_warnings import fat_warnings, label_warnings, stone_warnings
 from scenes.patients.kidney_plausibility import kidney_warnings
 from scenes.patients.label_shift import shift_warnings
 from scenes.patients.organ_selection import (
@@ -132,7 +133,7 @@ def import_patient(
     overview = _overview(level, level_hu)
     warnings = (
         *position_warnings(overview, actual_position),
-        *orientation_warnings(level, level_hu, labels, midline),
+        *orientation_warnings(overview, labels, midline, float(piece.grid.corners()[:, 2].mean())),
         *_tissue_warnings(piece, grid, hounsfield, on_ct, coded, tissues),
         *label_warnings(labels, piece, organ is not None, drawn or [labels]),
     )
