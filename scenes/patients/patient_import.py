@@ -19,6 +19,7 @@ from scenes.patients.body_orientation import orientation_warnings
 from scenes.patients.import_warnings import fat_warnings, label_warnings, stone_warnings
 from scenes.patients.kidney_plausibility import kidney_warnings
 from scenes.patients.label_shift import shift_warnings
+from scenes.patients.missing_slices import fill_missing_slices
 from scenes.patients.organ_selection import (
     HILAR,
     LESIONS,
@@ -26,7 +27,9 @@ from scenes.patients.organ_selection import (
     Organ,
     choose_organ,
     find_organs,
+    island_warnings,
     midline_x,
+    organ_values,
 )
 from scenes.patients.organ_support import bed_of_file, bed_of_labels, mould
 from scenes.patients.part_surfaces import (
@@ -118,7 +121,9 @@ def import_patient(
     """
     if not margin_mm >= 0:
         raise PatientError(f"the margin is {margin_mm} mm: expected 0 or more")
-    pieces = find_organs(labels, organ)
+    own = organ_values(labels, organ)
+    labels, warnings_of_slices = fill_missing_slices(labels, own)
+    pieces = find_organs(labels, own)
     slab, level_hu = _level(ct, pieces, margin_mm)
     level = ct.grid.part(slab)
     heights = np.concatenate([piece.grid.corners()[:, 2] for piece in pieces])
@@ -135,6 +140,8 @@ def import_patient(
         *position_warnings(overview, actual_position),
         *orientation_warnings(overview, labels, midline, float(piece.grid.corners()[:, 2].mean())),
         *_tissue_warnings(piece, grid, hounsfield, on_ct, coded, tissues),
+        *warnings_of_slices,
+        *island_warnings(labels, own, pieces, piece),
         *label_warnings(labels, piece, organ is not None, drawn or [labels]),
     )
     found = part_masks(labels, piece)

@@ -1,0 +1,175 @@
+"""A slice that nobody segmented is named and filled, bridged by the tumour or not; what is anatomy stays as it is."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from synthetic_body import (
+    BODY,
+    DIRECTIONS,
+    LEFT,
+    RIGHT,
+    TUMOUR,
+    body,
+    coarsely,
+    drawn,
+    grid_around,
+    points_of,
+)
+
+from scenes.patients.missing_slices import fill_missing_slices
+from scenes.patients.organ_selection import find_organs
+from scenes.patients.patient_import import import_patient
+from scenes.patients.patient_scene import hilum
+from scenes.patients.readers.label_files import open_labels
+from scenes.patients.readers.label_maps import LabelMap
+from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.voxel_grid import VoxelGrid
+
+NAMES = {1: "kidney_right", 2: "kidney_left", 3: "tumour"}
+ORGAN = [1, 2]
+
+
+def label_map(image, voxels=None):
+    voxels = sitk.GetArrayFromImage(image) if voxels is None else voxels
+    return LabelMap.valued(VoxelGrid.of(image), voxels.astype(np.uint8), NAMES)
+
+
+def without(image, slices, axis=2, keep=()):
+    """A label map whose slices along an axis (x, y, z) have none of the left side's labels but those kept."""
+    voxels = sitk.GetArrayFromImage(image)
+    is_left = points_of(image)[..., 0] > 0
+    view, left = np.moveaxis(voxels, 2 - axis, 0), np.moveaxis(is_left, 2 - axis, 0)
+    for k in slices:
+        view[k][left[k] & ~np.isin(view[k], keep)] = 0
+    return label_map(image, voxels)
+
+
+@pytest.fixture(scope="module")
+def thick():
+    return body(spacing=(2.0, 2.0, 5.0))
+
+
+def middle(labels, solid=LEFT):
+    """The number of the slice through the middle of a solid."""
+    return int(np.rint(VoxelGrid.of(labels).index(solid[0][None])[0, 2]))
+
+
+class TestFilled:
+    @pytest.mark.parametrize("count", [1, 2])
+    def test_the_organ_and_its_tumour(self, thick, count):
+        k = middle(thick[1], TUMOUR)
+        found, warnings = fill_missing_slices(without(thick[1], range(k, k + count)), ORGAN)
+        whole = sitk.GetArrayFromImage(thick[1])
+        for slices in range(k, k + count):
+            differ = (found.values[slices] > 0) != (whole[slices] > 0)
+            # Between two sections of an ellipsoid there is more of it than between their outlines.
+            assert differ.sum() < 0.1 * (whole[slices] > 1).sum()
+        assert np.array_equal(found.values[: k - 1], whole[: k - 1])
+        names = [warning for warning in warnings if "no kidney is labelled in" in warning]
+        assert len(names) == 1 and all(f"slice {n + 1} (z " in names[0] for n in range(k, k + count))
+        # Of two tumours each end may be two slices from the other.
+        assert any("no tumour is labelled in" in warning for warning in warnings) == (count == 1)
+
+    def test_a_slice_that_the_tumour_bridges(self, thick):
+        labels = without(thick[1], [middle(thick[1])], keep=(3,))
+        found, (warning,) = fill_missing_slices(labels, ORGAN)
+        assert f"slice {middle(thick[1]) + 1} (z " in warning and "no kidney" in warning
+        (piece,) = [p for p in find_organs(found, ORGAN) if p.centre_x_mm > 0]
+        (whole,) = [p for p in find_organs(label_map(thick[1]), ORGAN) if p.centre_x_mm > 0]
+        assert piece.volume_ml == pytest.approx(whole.volume_ml, rel=0.01)
+
+    def test_a_tumour_alone(self, thick):
+        voxels = sitk.GetArrayFromImage(thick[1])
+        k = middle(thick[1], TUMOUR)
+        voxels[k][voxels[k] == 3] = 2
+        found, (warning,) = fill_missing_slices(label_map(thick[1], voxels), ORGAN)
+        assert "no tumour is labelled in slice" in warning
+        assert (found.values[k] == 3).sum() == pytest.approx(
+            (sitk.GetArrayFromImage(thick[1])[k] == 3).sum(), rel=0.25
+        )
+
+    @pytest.mark.parametrize("axis", [0, 1, 2])
+    def test_along_any_axis_of_even_voxels(self, axis):
+        _, labels = body(spacing=(3.0, 3.0, 3.0))
+        k = int(np.rint(VoxelGrid.of(labels).index(LEFT[0][None])[0, axis]))
+        found, warnings = fill_missing_slices(without(labels, [k], axis), ORGAN)
+        assert f"slice {k + 1} ({'xyz'[axis]} " in " ".join(warnings)
+        plane = np.moveaxis(found.values, 2 - axis, 0)[k]
+        assert (plane == 2).any()
+
+    def test_the_numbers_are_those_of_a_turned_label(self):
+        _, labels = body(DIRECTIONS["slices first"], spacing=(5.0, 2.5, 2.5))
+        k = int(np.rint(VoxelGrid.of(labels).index(LEFT[0][None])[0, 0]))
+        _, warnings = fill_missing_slices(without(labels, [k], 0), ORGAN)
+        place = VoxelGrid.of(labels).place([[k, 0, 0]])[0]
+        assert f"slice {k + 1} (z {place[2]:.1f} mm, around x 7" in " ".join(warnings)
+
+
+def assert_left(labels, organ):
+    found, warnings = fill_missing_slices(labels, organ)
+    assert found is labels and warnings == ()
+
+
+class TestLeft:
+    """What is not missing."""
+
+    @pytest.mark.parametrize("spacing", [(2.5, 2.5, 5.0), (3.0, 3.0, 3.0)])
+    @pytest.mark.parametrize("direction", ["identity", "oblique", "slices first"])
+    def test_whole_kidneys(self, direction, spacing):
+        labels = label_map(body(DIRECTIONS[direction], spacing)[1])
+        assert_left(labels, ORGAN)
+
+    def test_a_wide_gap(self, thick):
+        k = middle(thick[1])
+        labels = without(thick[1], range(k - 1, k + 2))
+        assert_left(labels, ORGAN)
+
+    def test_two_tumours_apart(self):
+        empty = grid_around((30, -10, -60), (130, 80, 80), (2.0, 2.0, 3.0))
+        small = np.full(3, 7.0)
+        above, below = ((LEFT[0] + [10.0, 0, z], small) for z in (12.5, -12.5))
+        labels = label_map(drawn(empty, (2, LEFT), (3, above), (3, below)))
+        assert_left(labels, [2])
+
+    def test_a_cleft_that_does_not_divide_the_section(self):
+        """A sinus is open for some slices; around it there is kidney in each."""
+        empty = grid_around((30, -10, -60), (130, 80, 80), (2.0, 2.0, 4.0))
+        cleft = LEFT[0] - [25.0, 0, 0], np.array([35.0, 15.0, 3.0])
+        labels = label_map(drawn(empty, (2, LEFT), (0, cleft)))
+        assert_left(labels, [2])
+
+    @pytest.mark.parametrize(
+        "name", ["crlm_1004_labels/kidneys_provisional.nii.gz", "totalseg/kidneys.nii.gz"]
+    )
+    def test_real_kidneys(self, data: Path, name):
+        (labels,) = open_labels(data / "ct" / name).maps(None)
+        assert_left(labels, [1, 2])
+
+
+@pytest.mark.parametrize("keep", [(), (3,)])
+def test_a_slit_is_not_the_hilum(monkeypatch, thick, keep):
+    """The deepest place of the surface would be in it."""
+    coarsely(monkeypatch)
+    sinus = LEFT[0] - [27.0, 0, 15.0], np.array([14.0, 8.0, 8.0])
+    ct = drawn(thick[0], (40, BODY), (120, LEFT), (120, RIGHT), (70, TUMOUR))
+    image = drawn(thick[1], (1, RIGHT), (2, LEFT), (0, sinus), (3, TUMOUR))
+    labels = without(image, [middle(image) + 3], keep=keep)
+    patient = import_patient(LazyVolume.of(ct), labels, ORGAN, "left", margin_mm=10.0)
+    np.testing.assert_allclose(hilum(patient.organ, "left"), sinus[0] + [14.0, 0, 0], atol=8.0)
+    assert any("no kidney is labelled in slice" in warning for warning in patient.warnings)
+
+
+@pytest.mark.parametrize("ml", [0.5, 4.0])
+def test_an_island_is_named(monkeypatch, thick, ml):
+    coarsely(monkeypatch)
+    radius = np.cbrt(ml * 1000 * 3 / (4 * np.pi))
+    island = LEFT[0] + [0, 0, 62.0], np.full(3, radius)
+    labels = label_map(drawn(thick[1], (1, RIGHT), (2, LEFT), (3, TUMOUR), (2, island)))
+    patient = import_patient(LazyVolume.of(thick[0]), labels, ORGAN, "left", margin_mm=10.0)
+    named = [line for line in patient.warnings if "labelled as the organ" in line and "were left out" in line]
+    assert len(named) == (ml > 1)
+    # Those of the other kidney are none of this patient's organ.
+    other = import_patient(LazyVolume.of(thick[0]), labels, ORGAN, "right", margin_mm=10.0)
+    assert not any("were left out" in line for line in other.warnings)
