@@ -13,7 +13,7 @@ from scenes.patients.patient_position import Position
 from scenes.patients.readers.ct_series import ct_candidates, open_ct, read_dicom_headers
 from scenes.patients.readers.dicom_headers import DicomContents, Series
 from scenes.patients.readers.label_files import Segmentation, open_labels, segmentation_of
-from scenes.patients.readers.label_maps import absent_labels, assign_tissues, merge_label_maps
+from scenes.patients.readers.label_maps import LabelMap, absent_labels, assign_tissues, merge_label_maps
 from scenes.patients.readers.segment_names import Side
 from scenes.patients.readers.series_choice import choose_series
 from scenes.patients.readers.volume_folder import volume_files
@@ -54,6 +54,7 @@ def import_request(
         raise PatientError(f"{ct}: no such file or folder; check the path")
     tissues = tissues or {}
     segmentations: list[Segmentation] = []
+    maps: list[LabelMap] = []
     absent: tuple[str, ...] = ()
     no_tumour: tuple[str, ...] = ()
     if seed_mm is None:
@@ -88,7 +89,8 @@ def import_request(
         progress=progress,
     )
     # Several files of one kind have the same note.
-    notes = dict.fromkeys(note for segmentation in segmentations for note in segmentation.notes)
+    sources: list[Segmentation | LabelMap] = [*segmentations, *maps]
+    notes = dict.fromkeys(note for source in sources for note in source.notes)
     found = replace(
         patient,
         notes=(*patient.notes, *notes, *absent),

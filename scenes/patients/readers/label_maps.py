@@ -83,6 +83,7 @@ class LabelMap:
     grid: VoxelGrid
     values: np.ndarray  # uint8 or uint16 (z, y, x), 0 = background
     segments: dict[int, Segment]  # of each value that occurs
+    notes: tuple[str, ...] = ()  # what was mended when it was made
 
     @classmethod
     def of(cls, image: sitk.Image, names: Mapping[int, str] | None = None) -> LabelMap:
