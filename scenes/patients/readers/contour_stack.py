@@ -19,9 +19,11 @@ from scenes.volumes.voxel_grid import Box, VoxelGrid
 SAME_PLANE_MM = 0.1
 # A contour this near to a plane, as a share of the distance of planes, is on it: a CT's slices may be UNEVEN, and decimals are rounded.
 ON_PLANE = UNEVEN + 0.01
-# Gaps between planes that are interpolated: no wider than this [mm], and than this times a gap beside them, or in the middle of a body.
-MOST_GAP_MM, WIDER = 15.0, 2.5
-# A gap so much wider than usual lacks a contour.
+# The widest gap that is interpolated [mm]: three slices of 5 mm.
+MOST_GAP_MM = 15.0
+# A gap is near to one beside it in width up to this: contours on every second slice, then on every fourth; one slice left out.
+WIDER = 2.5
+# A gap so much wider than usual lacks a contour, and so far beyond its last section a body may reach.
 LACKS = 1.5
 # Neighbouring planes of one body share so much of the smaller one's area.
 LEAST_OVERLAP = 0.25
@@ -82,15 +84,8 @@ def stack_contours(
         PatientError: far outside the CT, not parallel to its slices, or with a gap that is too wide.
     """
     places = [ct.index(corners) for corners in contours]
+    _check_places(name, places, ct)
     ends = np.array(ct.size)
-    if any((place < -ends).any() or (place > 2 * ends).any() for place in places):
-        raise PatientError(
-            f"{name}: contours are far outside this CT; expected contours on it; give the CT that they were drawn on"
-        )
-    if max(np.ptp(place[:, 2]) for place in places) > 1:
-        raise PatientError(
-            f"{name}: contours cross the slices of this CT; expected contours on them; give the CT that they were drawn on"
-        )
     least, most = (-ends, 2 * ends) if near is None else np.array([(a.start, a.stop - 1) for a in near]).T
     places = [p for p in places if (p.max(axis=0) >= least).all() and (p.min(axis=0) <= most).all()]
     if not places:
@@ -112,12 +107,26 @@ def stack_contours(
         corners = without_copies([places[n][:, 1::-1] - low[::-1] for n in group])
         copies += len(group) - len(corners)
         plane[:] = fill(corners, plane.shape)
-    notes = [f"contours that stand twice in a plane, counted once: {copies}"] * bool(copies)
+    notes = (f"contours that stand twice in a plane, counted once: {copies}",) * bool(copies)
     if len(levels) != len(heights) or np.abs(levels - heights).max() > ON_PLANE * step:
-        inside = _on_levels(name, _Planes(heights, inside, low, ct), levels, step, is_organ, notes)
+        inside, of_gaps = _on_levels(name, _Planes(heights, inside, low, ct), levels, step, is_organ)
+        notes += of_gaps
     if len(inside) < size[2]:
         inside = np.concatenate([inside, np.zeros_like(inside)])
-    return Region(grid, inside, tuple(notes))
+    return Region(grid, inside, notes)
+
+
+def _check_places(name: str, places: list[np.ndarray], ct: VoxelGrid) -> None:
+    """Raises PatientError where corners (voxels of the CT) are far outside it, or those of a contour are of several slices."""
+    ends = np.array(ct.size)
+    if any((place < -ends).any() or (place > 2 * ends).any() for place in places):
+        raise PatientError(
+            f"{name}: contours are far outside this CT; expected contours on it; give the CT that they were drawn on"
+        )
+    if max(np.ptp(place[:, 2]) for place in places) > 1:
+        raise PatientError(
+            f"{name}: contours cross the slices of this CT; expected contours on them; give the CT that they were drawn on"
+        )
 
 
 def _by_plane(heights: np.ndarray, slice_mm: float) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -154,10 +163,10 @@ def _usual(gaps: np.ndarray) -> float:
 
 
 def _on_levels(
-    name: str, drawn: _Planes, levels: np.ndarray, step: float, is_organ: bool, notes: list[str]
-) -> np.ndarray:
-    """The mask on even planes (``levels``, ``step`` [slices]): as drawn, interpolated, or as the nearest plane where a body ends."""
-    continues = _continues(name, drawn, is_organ, notes)
+    name: str, drawn: _Planes, levels: np.ndarray, step: float, is_organ: bool
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The mask on even planes (``levels``, ``step`` [slices]), and notes: as drawn, interpolated, or as the nearest plane at an end."""
+    continues, notes = _continues(name, drawn, is_organ)
     gaps = np.diff(drawn.heights)
     usual = _usual(gaps)
     inside = np.zeros((len(levels), *drawn.inside.shape[1:]), bool)
@@ -182,30 +191,33 @@ def _on_levels(
     for n in np.flatnonzero(~used):
         inside[np.argmin(np.abs(levels - drawn.heights[n]))] |= drawn.inside[n]
     if lacking:
-        notes.append(
-            f"slices without a contour, interpolated between their neighbours, at {listed(lacking)} mm"
+        notes += (
+            f"slices without a contour, interpolated between their neighbours, at {listed(lacking)} mm",
         )
     if uneven:
-        notes.append(f"contours are unevenly spaced; planes interpolated between them: {uneven}")
-    return inside
+        notes += (f"contours are unevenly spaced; planes interpolated between them: {uneven}",)
+    return inside, notes
 
 
-def _continues(name: str, drawn: _Planes, is_organ: bool, notes: list[str]) -> list[bool]:
-    """Whether one body is on both sides of each gap between planes, and the gap can be interpolated.
+def _continues(name: str, drawn: _Planes, is_organ: bool) -> tuple[list[bool], tuple[str, ...]]:
+    """Whether one body is on both sides of each gap between planes, and the gap can be interpolated; and notes.
 
     The sections beside it overlap, and the gap is not much wider than one beside it, or one of the sections is no end of a body.
     Raises PatientError where the gap of an organ is too wide.
     """
-    gaps, areas, found = drawn.gaps_mm, drawn.areas, []
+    gaps, areas = drawn.gaps_mm, drawn.areas
     usual = _usual(gaps)
+    continues: list[bool] = []
+    notes: tuple[str, ...] = ()
     for n, gap in enumerate(gaps):
-        both = drawn.inside[n] & drawn.inside[n + 1]
-        is_over = both.any() and both.sum() >= LEAST_OVERLAP * drawn.inside[n : n + 2].sum(axis=(1, 2)).min()
+        pair = drawn.inside[n : n + 2]
+        shared, smaller = pair.all(axis=0).sum(), pair.sum(axis=(1, 2)).min()
+        is_over = shared > 0 and shared >= LEAST_OVERLAP * smaller
         beside = np.delete(gaps[max(n - 1, 0) : n + 2], min(n, 1))
         is_near = gap <= WIDER * max(beside, default=usual)
-        ends = _is_end(areas[: n + 1], areas[n], usual) and _is_end(areas[n + 1 :], areas[n + 1], usual)
-        is_one = bool(is_over and (is_near or not ends))
-        found.append(is_one and gap <= MOST_GAP_MM)
+        are_ends = _is_end(areas[n], areas[: n + 1], usual) and _is_end(areas[n + 1], areas[n + 1 :], usual)
+        is_one = bool(is_over and (is_near or not are_ends))
+        continues.append(is_one and gap <= MOST_GAP_MM)
         if is_one and gap > MOST_GAP_MM:
             between = " and ".join(map(drawn.place, drawn.heights[n : n + 2]))
             if is_organ:
@@ -213,16 +225,16 @@ def _continues(name: str, drawn: _Planes, is_organ: bool, notes: list[str]) -> l
                     f"{name} has no contour between {between} mm; expected at most {MOST_GAP_MM:g} mm without one; draw the contours "
                     "between, or make its parts regions of their own"
                 )
-            notes.append(f"a gap too wide to interpolate was left empty, between {between} mm")
-    return found
+            notes += (f"a gap too wide to interpolate was left empty, between {between} mm",)
+    return continues, notes
 
 
-def _is_end(areas: np.ndarray, section: float, usual_mm: float) -> bool:
-    """Whether a section [mm^2] may be the last of a body: of a ball with the largest of its sections, the cap beyond is so low.
+def _is_end(section: float, areas: np.ndarray, usual_mm: float) -> bool:
+    """Whether a section [mm^2] may be the last of a body: the cap beyond it, of a ball with the largest section, is little higher than usual.
 
     Args:
-        areas: of the sections on its side of a gap.
-        section: of the one beside the gap.
+        section: the one beside a gap.
+        areas: of all sections on its side.
         usual_mm: the usual distance of planes.
     """
     cap = np.sqrt(areas.max() / np.pi) - np.sqrt((areas.max() - section) / np.pi)
@@ -232,10 +244,10 @@ def _is_end(areas: np.ndarray, section: float, usual_mm: float) -> bool:
 def _interpolated(pair: np.ndarray, share: float, spacing: np.ndarray) -> np.ndarray:
     """The section (y, x) between two (2, y, x) of one body, at a share of their distance from the first."""
     x, y, _ = box_of(pair)
-    levels = [_signed_distance(np.pad(section, 1), spacing) for section in pair[:, y, x]]
-    found = np.zeros(pair.shape[1:], bool)
-    found[y, x] = ((1 - share) * levels[0] + share * levels[1] < 0)[1:-1, 1:-1]
-    return found
+    below, above = (_signed_distance(np.pad(section, 1), spacing) for section in pair[:, y, x])
+    between = np.zeros(pair.shape[1:], bool)
+    between[y, x] = ((1 - share) * below + share * above < 0)[1:-1, 1:-1]
+    return between
 
 
 def _signed_distance(section: np.ndarray, spacing: np.ndarray) -> np.ndarray:
