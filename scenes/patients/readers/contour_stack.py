@@ -30,7 +30,7 @@ LEAST_OVERLAP = 0.25
 
 
 @dataclass(frozen=True)
-class Region:
+class FilledRegion:
     """A region's mask."""
 
     grid: VoxelGrid
@@ -67,7 +67,7 @@ class _Planes:
 
 def stack_contours(
     name: str, contours: list[np.ndarray], ct: VoxelGrid, near: Box | None, is_organ: bool, progress: Progress
-) -> Region | None:
+) -> FilledRegion | None:
     """A region on planes of its contours, or on the CT's where these are uneven; in each a CT's pixels. None where none is near.
 
     Nested contours on one plane alternate between inside and outside; a contour that stands there twice counts once.
@@ -113,7 +113,7 @@ def stack_contours(
         notes += of_gaps
     if len(inside) < size[2]:
         inside = np.concatenate([inside, np.zeros_like(inside)])
-    return Region(grid, inside, notes)
+    return FilledRegion(grid, inside, notes)
 
 
 def _check_places(name: str, places: list[np.ndarray], ct: VoxelGrid) -> None:
