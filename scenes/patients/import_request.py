@@ -125,13 +125,14 @@ def organ_labels(
     absent = {tissue: absent_labels(maps, {tissue: words}) for tissue, words in tissues.items()}
     no_tumour = [f"{text}; the labels are {merged.listed()}" for text in absent.pop("tumour", ())]
     # Several files of one kind have the same note.
-    notes = dict.fromkeys(note for segmentation in segmentations for note in segmentation.notes)
+    sources: list[Segmentation | LabelMap] = [*segmentations, *maps]
+    notes = dict.fromkeys(note for source in sources for note in source.notes)
     return OrganLabels(
         merged=merged,
         own=own,
         drawn=tuple(drawn),
         notes=(*notes, *notes_of_choice, *chain(*absent.values())),
-        warnings=tuple(no_tumour),
+        warnings=(*no_tumour, *chain(*(one.warnings for one in maps))),
     )
 
 

@@ -257,6 +257,23 @@ def test_a_value_that_no_voxel_has_is_noted(hospital, taken_in, tmp_path, monkey
     assert not any("tumour's label" in note for note in patient.notes)
 
 
+@pytest.mark.parametrize(
+    ("kept", "often", "note"),
+    [
+        ([0, 1, 2, 3, 4], 2, "region 1: contours that stand twice in a plane, counted once: 5"),
+        ([0, 1, 3, 4], 1, "region 1: slices without a contour, interpolated between their neighbours, at z 12.5 mm"),
+    ],
+)  # fmt: skip
+def test_what_was_mended_in_contours_is_noted(hospital, taken_in, tmp_path, monkeypatch, kept, often, note):
+    monkeypatch.setattr("scenes.patients.import_request.import_patient", lambda *_, **__: taken_in)
+    turn = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    circle = LEFT[0] + 15 * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
+    contours = [circle + [0, 0, 3.5 * k - 6.5] for k in kept] * often
+    path = write_structures(tmp_path / "rt.dcm", {"Kidney left": contours}, hospital[1].uid)
+    patient = import_request(hospital[0] / "ct", [path])
+    assert note in (*patient.notes, *patient.warnings)
+
+
 def test_a_seed_makes_a_draft(hospital, taken_in, monkeypatch):
     labels = LabelMap.of(sitk.Image([4, 4, 4], sitk.sitkUInt8) + 1)
     monkeypatch.setattr("scenes.patients.import_request.draft_segmentation", lambda ct, seed: labels)

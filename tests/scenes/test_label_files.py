@@ -125,20 +125,21 @@ class TestSegmentations:
 
 
 class TestContours:
-    def test_a_plane_left_out(self, tmp_path):
-        """Planes stay where they were drawn; between them one is empty."""
+    @pytest.mark.parametrize(("planes", "filled"), [((1, 2, 4), (1, 2, 3, 4)), ((0, 1, 2, 5), (0, 1, 2, 5))])
+    def test_a_plane_left_out(self, tmp_path, planes, filled):
+        """Planes stay where they were drawn; one without a contour is interpolated, more of them between two ends are not."""
         series = Series(tmp_path / "ct")
-        rings = [ring(series.places(k)[5, 6], 2.6, series.direction) for k in (1, 2, 4)]
+        rings = [ring(series.places(k)[5, 6], 2.6, series.direction) for k in planes]
         path = write_structures(tmp_path / "rt.dcm", {"Kidney": rings})
         found = by_name(open_labels(path).maps(ct_grid(series)), ct_grid(series))["Kidney"]
-        assert found.any(axis=(1, 2)).tolist() == [False, True, True, False, True, False]
+        assert np.flatnonzero(found.any(axis=(1, 2))).tolist() == list(filled)
 
-    def test_uneven_planes(self, tmp_path):
+    @pytest.mark.parametrize(("at", "filled"), [((0, 1, 2.4), (1, 2, 3)), ((0, 1.4, 2, 3), (1, 2, 3, 4))])
+    def test_uneven_planes(self, tmp_path, at, filled):
+        """They are interpolated onto the CT's."""
         series = Series(tmp_path / "ct")
         middle = series.places(1)[5, 6]
-        rings = [
-            ring(middle + at * series.gap * series.direction[:, 2], 2.6, series.direction)
-            for at in (0, 1, 2.5)
-        ]
+        rings = [ring(middle + n * series.gap * series.direction[:, 2], 2.6, series.direction) for n in at]
         path = write_structures(tmp_path / "rt.dcm", {"Kidney": rings})
-        assert "unevenly spaced" in refusal(path, read=lambda path: open_labels(path).maps(ct_grid(series)))
+        found = by_name(open_labels(path).maps(ct_grid(series)), ct_grid(series))["Kidney"]
+        assert np.flatnonzero(found.any(axis=(1, 2))).tolist() == list(filled)

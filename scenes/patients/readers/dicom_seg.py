@@ -10,6 +10,7 @@ import numpy as np
 from pydicom.dataset import Dataset
 from pydicom.pixels import pixel_array
 from pydicom.pixels.utils import pack_bits
+from pydicom.tag import Tag
 from pydicom.uid import ExplicitVRLittleEndian, generate_uid
 
 from errors import PatientError, parsing
@@ -27,6 +28,8 @@ HALF = 0.5
 # The value for "inside" where tilted frames are resampled as if they were HU.
 FULL_HU = 1000.0
 UNCOMPRESSED = "export it again, uncompressed, or as a label map, for example NRRD"
+# What all segmentations have, where the writer left it out.
+ALWAYS = {"SamplesPerPixel": 1, "PhotometricInterpretation": "MONOCHROME2", "PixelRepresentation": 0}
 
 
 def read_segmentation(
@@ -45,17 +48,19 @@ def read_segmentation(
     logging.getLogger("highdicom").setLevel(logging.ERROR)
     data = item.parsed()
     references = references_of(data)
+    with parsing(f"{item.name}: cannot be read as a DICOM segmentation", "export it again"):
+        segments = _segments(item, data)
     _decode(item, data)
     with parsing(
         f"{item.name}: cannot be read as a DICOM segmentation",
         "expected evenly spaced frames in the patient's coordinates; export it as a label map, for example NRRD",
     ):
         _complete(item, data)
+        shift = _reduce(data)
         segmentation = hd.seg.Segmentation.from_dataset(data, copy=False)
-        segments = _segments(item, segmentation)
         left_out = [one for one in segments if is_left_out(one, wanted)]
         kept = [one for one in segments if one not in left_out]
-        maps, grid = _maps(item, segmentation, kept, progress)
+        maps, grid = _maps(item, segmentation, kept, shift, progress)
     if not maps:
         raise PatientError(
             f"{item.name}: is empty, no voxel is labelled; expected an organ; choose another file"
@@ -72,7 +77,12 @@ def read_segmentation(
 
 
 def _decode(item: SourceFile, data: Dataset) -> None:
-    """Replace frames that highdicom cannot read: big endian ones, and single bits that are compressed as bytes."""
+    """Complete the description of pixels, and replace frames that highdicom cannot read: big endian ones, and single bits that are compressed as bytes."""
+    for name, value in ALWAYS.items():
+        if data.get(name) is None:
+            setattr(data, name, value)
+    if data.get("BitsStored") is None and data.get("BitsAllocated"):
+        data.BitsStored = data.BitsAllocated
     syntax = data.file_meta.TransferSyntaxUID
     if not syntax.is_transfer_syntax:
         raise PatientError(f"{_undecoded(item, data)}: an unknown transfer syntax; {UNCOMPRESSED}")
@@ -111,39 +121,102 @@ def _undecoded(item: SourceFile, data: Dataset) -> str:
 
 
 def _complete(item: SourceFile, data: Dataset) -> None:
-    """Give frames in the patient's coordinates a frame of reference where an anonymiser took it. Raises PatientError for others."""
-    groups = [*data.SharedFunctionalGroupsSequence, *data.PerFrameFunctionalGroupsSequence[:1]]
+    """Give frames in the patient's coordinates what highdicom requires, and writers or anonymisers leave out. Raises PatientError for others."""
+    frames = data.PerFrameFunctionalGroupsSequence
+    if not data.get("NumberOfFrames"):
+        data.NumberOfFrames = len(frames)
+    if not data.get("SharedFunctionalGroupsSequence"):
+        data.SharedFunctionalGroupsSequence = [Dataset()]
+    groups = [*data.SharedFunctionalGroupsSequence, *frames[:1]]
     planes = [group.PlaneOrientationSequence[0] for group in groups if group.get("PlaneOrientationSequence")]
     if not any("ImageOrientationPatient" in plane for plane in planes):
         raise PatientError(
             f"{item.name}: has no ImageOrientationPatient, so it belongs to no volume; expected labels of a CT; choose another file"
         )
-    if not data.get("FrameOfReferenceUID"):
-        data.FrameOfReferenceUID = generate_uid()
+    for name in ("FrameOfReferenceUID", "StudyInstanceUID"):
+        if not data.get(name):
+            setattr(data, name, generate_uid())
+    for group in (*data.SharedFunctionalGroupsSequence, *frames):
+        for measures in group.get("PixelMeasuresSequence") or []:
+            if not measures.get("SliceThickness"):  # positions alone give the distance of frames
+                measures.SliceThickness = measures.get("SpacingBetweenSlices") or 1
 
 
-def _segments(item: SourceFile, segmentation: hd.seg.Segmentation) -> list[Segment]:
-    """All segments, without the background, with the tissue of the coded property where the label names none."""
-    found = []
-    for number in segmentation.segment_numbers:
-        if number == 0:  # background
-            continue
-        described = segmentation.get_segment_description(number)
-        meaning = dicom_meaning(described)
-        found.append(Segment.coded(item.name, described.segment_label, meaning, int(number)))
-    return found
+def _reduce(data: Dataset) -> int:
+    """Leave only what voxels and their places need, so that nothing else has to be there. Segments are described by plain codes.
+
+    Returns:
+        What was added to the numbers of segments, as highdicom's are from 1.
+    """
+    is_map = data.SegmentationType == "LABELMAP"
+    numbers = [int(one.SegmentNumber) for one in data.SegmentSequence]
+    shift = int(0 in numbers and not is_map)
+    code = hd.sr.CodedConcept("85756007", "SCT", "Tissue")
+    manual = hd.seg.SegmentAlgorithmTypeValues.MANUAL
+    described = [hd.seg.SegmentDescription(1, "segment", code, code, manual) for _ in numbers]
+    for one, number in zip(described, numbers, strict=True):
+        one.SegmentNumber = number + shift
+    data.SegmentSequence = described
+    for name in ("ReferencedSeriesSequence", "SourceImageSequence", "DimensionIndexSequence"):
+        data.pop(name, None)
+    groups = data.PerFrameFunctionalGroupsSequence
+    for group in groups:
+        group.pop("DerivationImageSequence", None)
+    if is_map:
+        return shift
+    index = Dataset()
+    index.DimensionIndexPointer = Tag("ReferencedSegmentNumber")
+    index.FunctionalGroupPointer = Tag("SegmentIdentificationSequence")
+    data.DimensionIndexSequence = [index]
+    shared = data.SharedFunctionalGroupsSequence[0].get("SegmentIdentificationSequence")
+    data.SharedFunctionalGroupsSequence[0].pop("SegmentIdentificationSequence", None)
+    for group in groups:
+        own = group.get("SegmentIdentificationSequence") or shared
+        if not own and len(numbers) > 1:
+            raise ValueError
+        number = int(own[0].ReferencedSegmentNumber) if own else numbers[0]
+        identified, content = Dataset(), Dataset()
+        identified.ReferencedSegmentNumber = content.DimensionIndexValues = number + shift
+        group.SegmentIdentificationSequence, group.FrameContentSequence = [identified], [content]
+    return shift
+
+
+def _segments(item: SourceFile, data: Dataset) -> list[Segment]:
+    """All segments, without the background, with the tissue of the coded property where the label names none.
+
+    Raises PatientError where a label map's background is described as a structure.
+    """
+    described = [
+        Segment.coded(
+            item.name, str(one.get("SegmentLabel") or ""), dicom_meaning(one), int(one.SegmentNumber)
+        )
+        for one in data.SegmentSequence
+    ]
+    if data.get("SegmentationType") != "LABELMAP":
+        return described
+    for segment in described:
+        if segment.value == 0 and segment.is_understood and data.get("PixelPaddingValue") != 0:
+            raise PatientError(
+                f"{item.name}: SegmentNumber of segment {segment} is 0, which is the background of a label map; expected numbers from 1; "
+                "number the segments and their voxels from 1, or export it as a binary segmentation"
+            )
+    return [segment for segment in described if segment.value != 0]
 
 
 def _maps(
-    item: SourceFile, segmentation: hd.seg.Segmentation, segments: list[Segment], progress: Progress
+    item: SourceFile,
+    segmentation: hd.seg.Segmentation,
+    segments: list[Segment],
+    shift: int,
+    progress: Progress,
 ) -> tuple[list[LabelMap], VoxelGrid | None]:
-    """The maps of the segments that are not empty, and the grid of all frames."""
+    """The maps of the segments that are not empty, and the grid of all frames; ``shift`` is as ``_reduce`` returns it."""
     is_upright = segmentation.get_volume_geometry(allow_missing_positions=True) is not None
     read = _upright if is_upright else _tilted
     maps, whole = [], None
     for segment in progress(segments, "segments"):
         with parsing(_undecoded(item, segmentation), UNCOMPRESSED):
-            whole, inside = read(item, segmentation, cast(int, segment.value))
+            whole, inside = read(item, segmentation, cast(int, segment.value) + shift)
         if inside.any():
             maps.append(LabelMap.single(whole, inside, segment))
     return maps, whole
@@ -162,9 +235,8 @@ def _upright(
 def _tilted(item: SourceFile, segmentation: hd.seg.Segmentation, number: int) -> tuple[VoxelGrid, np.ndarray]:
     """The same for frames of a tilted gantry: resampled as CT slices are, as if they were HU."""
     most = float(segmentation.get("MaximumFractionalValue") or 1)
-    shared = segmentation.SharedFunctionalGroupsSequence[0].get("SegmentIdentificationSequence")
     groups = segmentation.PerFrameFunctionalGroupsSequence
-    identified = [frame.get("SegmentIdentificationSequence", shared)[0] for frame in groups]
+    identified = [frame.SegmentIdentificationSequence[0] for frame in groups]
     own = [
         replace(one, slope=FULL_HU / most, intercept=0.0)
         for one, frame in zip(slices_of(item, item.header(TAGS)), identified, strict=True)

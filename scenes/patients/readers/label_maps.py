@@ -93,6 +93,8 @@ class LabelMap:
     grid: VoxelGrid
     values: np.ndarray  # uint8 or uint16 (z, y, x), 0 = background
     segments: dict[int, Segment]  # of each value that occurs
+    notes: tuple[str, ...] = ()  # what was mended when it was made
+    warnings: tuple[str, ...] = ()  # what was missing, and is assumed
 
     @classmethod
     def of(cls, image: sitk.Image, names: Mapping[int, str] | None = None) -> LabelMap:

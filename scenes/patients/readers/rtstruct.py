@@ -1,12 +1,13 @@
-"""Read the contours of a DICOM RTSTRUCT and fill them on their planes."""
+"""Read the regions of a DICOM RTSTRUCT: their names, types and closed contours."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 from pydicom.dataset import Dataset
-from skimage.draw import polygon
 
 from errors import PatientError, parsing
+from scenes.patients.readers.contour_stack import stack_contours
 from scenes.patients.readers.dicom_files import SourceFile
 from scenes.patients.readers.label_headers import references_of
 from scenes.patients.readers.label_maps import (
@@ -15,15 +16,17 @@ from scenes.patients.readers.label_maps import (
     Segment,
     Segmentation,
     is_left_out,
+    listed,
     note_of_left_out,
 )
 from scenes.terminal import Progress, silent
-from scenes.volumes.voxel_grid import Box, VoxelGrid
+from scenes.volumes.voxel_grid import VoxelGrid
 
-# Largest deviation of a contour from the even planes, as a share of their distance.
-OFF_PLANE = 0.3
 MOST_POINTS = 20_000_000
-STRIP_ROWS = 16
+# Values of ContourGeometricType that enclose an area, as they are and without underscores.
+CLOSED = {"CLOSEDPLANAR", "CLOSEDPLANARXOR", "INTERPOLATEDPLANAR"}
+# Tissues of the organ and its lesions, of which no part may be lost.
+ORGAN = {"kidney", "tumour", "cyst"}
 # Values of RTROIInterpretedType that are no tissue.
 NO_TISSUE = {"EXTERNAL", "SUPPORT", "FIXATION", "BOLUS"}
 
@@ -57,11 +60,12 @@ def read_structures(
         raise PatientError(
             f"{item.name}: its regions are in {len(references.frames)} frames of reference; expected one; export the regions of one CT"
         )
-    notes = note_of_left_out(left_out)
+    empty = tuple(segment for segment, points in contours if not points)
+    notes = (*note_of_left_out(left_out), *_note_of_empty(empty))
 
     def maps(ct: VoxelGrid) -> list[LabelMap]:
         drawn = [(segment, points) for segment, points in contours if points]
-        filled = _filled_regions(item.name, drawn, ct, progress)
+        filled = _filled_regions(item.name, drawn, ct, wanted, progress)
         if not filled:
             why = "".join(f" ({note})" for note in notes)
             raise PatientError(
@@ -73,8 +77,13 @@ def read_structures(
         maps,
         notes=notes,
         references=references,
-        empty=tuple(segment for segment, points in contours if not points),
+        empty=empty,
     )
+
+
+def _note_of_empty(segments: Sequence[Segment]) -> tuple[str, ...]:
+    names = listed([str(segment) for segment in segments])
+    return (f"without a closed contour, so not read: {names}",) * bool(segments)
 
 
 def _regions(data: Dataset) -> list[tuple[Segment, Dataset, str]]:
@@ -92,7 +101,11 @@ def _regions(data: Dataset) -> list[tuple[Segment, Dataset, str]]:
 
 
 def _filled_regions(
-    name: str, regions: list[tuple[Segment, list[np.ndarray]]], ct: VoxelGrid, progress: Progress
+    name: str,
+    regions: list[tuple[Segment, list[np.ndarray]]],
+    ct: VoxelGrid,
+    wanted: Collection[str],
+    progress: Progress,
 ) -> list[LabelMap]:
     """The regions that have contours; where there are kidneys, the others only near them."""
     kidneys = [points for segment, contours in regions if segment.tissue == "kidney" for points in contours]
@@ -100,13 +113,20 @@ def _filled_regions(
     if kidneys:
         places = np.concatenate(kidneys)
         near = ct.box_around(places.min(axis=0) - NEAR_MM, places.max(axis=0) + NEAR_MM)
-    found = []
+    filled = []
     for segment, contours in regions:
         box = None if segment.tissue == "kidney" else near
-        filled = _filled(name, contours, ct, box, progress)
-        if filled and filled[1].any():
-            found.append(LabelMap.single(*filled, segment))
-    return found
+        is_organ = segment.tissue in ORGAN or any(segment.matches(word) for word in wanted)
+        region = stack_contours(f"{name}: region {segment}", contours, ct, box, is_organ, progress)
+        if region and region.inside.any():
+            notes, warnings = (
+                tuple(f"region {segment.value}: {line}" for line in lines)
+                for lines in (region.notes, region.warnings)
+            )
+            one = LabelMap.single(region.grid, region.inside, segment)
+            notes, warnings = (notes, warnings) if is_organ else ((*notes, *warnings), ())
+            filled.append(replace(one, notes=notes, warnings=warnings))
+    return filled
 
 
 def _colour(roi: Dataset) -> tuple[float, float, float] | None:
@@ -122,7 +142,7 @@ def _contours(roi: Dataset) -> list[np.ndarray]:
     closed = [
         c
         for c in roi.get("ContourSequence") or []
-        if c.get("ContourGeometricType") in ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")
+        if str(c.get("ContourGeometricType") or "").strip().upper().replace("_", "") in CLOSED
     ]
     points = [_points(c) for c in closed]
     if sum(map(len, points)) > MOST_POINTS or not all(np.isfinite(p).all() for p in points):
@@ -134,75 +154,3 @@ def _points(contour: Dataset) -> np.ndarray:
     """Points (n, 3) of a contour; pydicom converts each number to an object, which takes ten times as long."""
     value = contour.get_item("ContourData").value
     return np.array(value.split(b"\\") if isinstance(value, bytes) else value, float).reshape(-1, 3)
-
-
-def _filled(
-    name: str, contours: list[np.ndarray], ct: VoxelGrid, near: Box | None, progress: Progress
-) -> tuple[VoxelGrid, np.ndarray] | None:
-    """Grid and mask (z, y, x) of a region: a CT's pixels on the planes of its contours; None where none is near.
-
-    Nested contours on one plane alternate between inside and outside.
-
-    Args:
-        name: of the file, for errors.
-        contours: points (n, 3) of each, LPS [mm].
-        ct: the CT's voxels.
-        near: the box of voxels outside which nothing is filled; None: all is filled.
-        progress: shows the progress of the contours.
-
-    Raises:
-        PatientError: far outside the CT, or not parallel to its slices.
-    """
-    places = [ct.index(points) for points in contours]
-    ends = np.array(ct.size)
-    if any((place < -ends).any() or (place > 2 * ends).any() for place in places):
-        raise PatientError(
-            f"{name}: contours are far outside this CT; expected contours on it; give the CT that they were drawn on"
-        )
-    if max(np.ptp(place[:, 2]) for place in places) > 1:
-        raise PatientError(
-            f"{name}: contours cross the slices of this CT; expected contours on them; give the CT that they were drawn on"
-        )
-    least, most = (-ends, 2 * ends) if near is None else np.array([(a.start, a.stop - 1) for a in near]).T
-    places = [p for p in places if (p.max(axis=0) >= least).all() and (p.min(axis=0) <= most).all()]
-    if not places:
-        return None
-    heights = np.array([place[:, 2].mean() for place in places])
-    step, numbers = _planes(name, heights)
-    low = np.floor(np.min([p[:, :2].min(axis=0) for p in places], axis=0)).astype(int) - 1
-    high = np.ceil(np.max([p[:, :2].max(axis=0) for p in places], axis=0)).astype(int) + 1
-    low, high = np.maximum(low, least[:2]), np.minimum(high, most[:2])
-    size = (*(high - low + 1).tolist(), max(2, int(numbers.max()) + 1))
-    origin = ct.place(np.array([low[0], low[1], heights.min()]))
-    grid = VoxelGrid(size, ct.spacing * (1, 1, step), origin, ct.direction).checked(name)
-    inside = np.zeros(size[::-1], bool)
-    for place, number in progress(list(zip(places, numbers, strict=True)), "contours"):
-        _toggle(inside[number], place[:, 1::-1] - low[::-1])
-    return grid, inside
-
-
-def _toggle(plane: np.ndarray, corners: np.ndarray) -> None:
-    """Invert the pixels (rows, columns) in and on a polygon with corners (n, 2).
-
-    Strip by strip, as each pixel is compared with each corner: of those above a strip, or below it, only the first and last of a
-    row of them count.
-    """
-    for start in range(0, len(plane), STRIP_ROWS):
-        strip = plane[start : start + STRIP_ROWS]
-        side = (corners[:, 0] > start + len(strip)) - 1 * (corners[:, 0] < start - 1)
-        between = (side != 0) & (side == np.roll(side, 1)) & (side == np.roll(side, -1))
-        part = corners[~between]
-        if len(part):
-            strip[polygon(part[:, 0] - start, part[:, 1], strip.shape)] ^= True
-
-
-def _planes(name: str, heights: np.ndarray) -> tuple[float, np.ndarray]:
-    """The distance of even planes [slices], and the plane of each contour, from 0. Raises PatientError where they are uneven."""
-    gaps = np.diff(np.unique(np.round(heights, 2)))
-    step = float(gaps[gaps > OFF_PLANE].min()) if (gaps > OFF_PLANE).any() else 1.0
-    numbers = (heights - heights.min()) / step
-    if np.abs(numbers - np.rint(numbers)).max() > OFF_PLANE:
-        raise PatientError(
-            f"{name}: contours are unevenly spaced; expected one distance between planes; export it as a label map"
-        )
-    return step, np.rint(numbers).astype(int)
