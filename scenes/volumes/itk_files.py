@@ -9,6 +9,7 @@ import numpy as np
 import SimpleITK as sitk
 
 from errors import PatientError, parsing
+from scenes.atomic_files import plain_path
 from scenes.volumes.lazy_volume import LazyVolume, check_size, no_scalar
 from scenes.volumes.voxel_grid import Box, VoxelGrid, check_3d
 
@@ -25,8 +26,12 @@ def itk_volume(path: Path, vectors: bool = False) -> LazyVolume:
     is_nrrd = path.suffix.lower() in NRRD
     reader = sitk.ImageFileReader()
     reader.SetImageIO("NrrdImageIO" if is_nrrd else "MetaImageIO")
-    reader.SetFileName(str(path))
-    with parsing(f"{path}: cannot be read as an image", "expected a whole file; copy or export it again"):
+    failed = f"{path}: cannot be read as an image"
+    with (
+        plain_path(path, data_file) as name,
+        parsing(failed, "expected a whole file; copy or export it again"),
+    ):
+        reader.SetFileName(name)
         reader.ReadImageInformation()
     check_3d(str(path), reader.GetSize())
     if is_nrrd and not reader.HasMetaDataKey("NRRD_space"):
@@ -46,15 +51,19 @@ def itk_volume(path: Path, vectors: bool = False) -> LazyVolume:
         for key, text in metadata.items()
         if text and not key.startswith(("NRRD_", "ITK_", "Segment"))
     }
-    return LazyVolume(str(path), grid, partial(_itk_box, path), identifiers=own, metadata=metadata)
+    return LazyVolume(str(path), grid, partial(_itk_box, path, data_file), identifiers=own, metadata=metadata)
 
 
-def _itk_box(path: Path, box: Box) -> np.ndarray:
+def _itk_box(path: Path, data_file: Path, box: Box) -> np.ndarray:
     reader = sitk.ImageFileReader()
-    reader.SetFileName(str(path))
     reader.SetExtractIndex([a.start for a in box])
     reader.SetExtractSize([a.stop - a.start for a in box])
-    with parsing(f"{path}: cannot be read to its end", "expected a whole file; copy or export it again"):
+    failed = f"{path}: cannot be read to its end"
+    with (
+        plain_path(path, data_file) as name,
+        parsing(failed, "expected a whole file; copy or export it again"),
+    ):
+        reader.SetFileName(name)
         return sitk.GetArrayFromImage(reader.Execute())
 
 
