@@ -28,6 +28,7 @@ import app
 from rehearsal.commands.command_line import CommandError
 from rehearsal.commands.rehearse_command import why_no_display
 from rehearsal.commands.rehearse_options import RehearseOptions
+from render.display import X11Screen
 from studies.study_command import STUDIES
 from version import VERSION
 
@@ -157,6 +158,15 @@ def test_a_window_without_vulkan_is_refused_before_anything_is_built(monkeypatch
     monkeypatch.setattr("rehearsal.commands.rehearse_command.display_available", lambda: True)
     monkeypatch.setattr("sim.device.is_available", lambda arch: arch != "vulkan")
     assert "install a Vulkan driver" in refused("rehearse", "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="of X11")
+@pytest.mark.parametrize("depth", [16, 30])
+def test_a_screen_on_which_a_driver_would_end_the_process_is_refused(monkeypatch, tmp_path, depth):
+    monkeypatch.setattr("render.display._of_x11", lambda name: X11Screen(1920, 1080, 1.0, depth))
+    monkeypatch.setattr("sim.device.is_available", lambda arch: True)
+    assert f"has {depth} bits of colour; expected 24" in refused("rehearse", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

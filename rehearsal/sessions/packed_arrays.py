@@ -34,7 +34,7 @@ LEAST_STEP_S, MOST_STEP_S = 1e-6, 10.0
 
 # What NumPy and zipfile raise for unreadable data.
 UNREADABLE = (
-    *(ValueError, LookupError, TypeError, RuntimeError, OSError, EOFError, MemoryError),
+    *(ValueError, LookupError, TypeError, RuntimeError, OSError, EOFError, MemoryError, ArithmeticError),
     *(zipfile.BadZipFile, zlib.error, struct.error),
 )
 
@@ -177,6 +177,8 @@ def unpack_state(text: str, like: RehearsalState) -> RehearsalState:
         turn = tuple(map(float, arrays["grip.turn_deg"].reshape(3)))
         depth, pressed = float(arrays["grip.depth_mm"]), float(arrays["grip.pressed_mm"])
         aim = _pose(arrays, "grip.aim") if "grip.aim" in arrays else None
+        if not np.isfinite([*turn, depth, pressed]).all():
+            raise StateError("a manipulator that is not finite")
         grip = ManipulatorState(depth, pressed, turn, aim)  # type: ignore[arg-type]
         pose = _pose(arrays, "pose")
         resection = _resection(arrays, like.solver.body.position.shape)
@@ -237,4 +239,6 @@ def _solver(arrays: dict[str, np.ndarray], name: str, like: SolverState) -> Solv
         return values
 
     body = BodyState(taken("position", like.body.position), taken("velocity", like.body.velocity))
+    if not (np.isfinite(body.position).all() and np.isfinite(body.velocity).all()):
+        raise StateError("positions or velocities that are not finite")
     return SolverState(body, {key: taken(f"contacts.{key}", old) for key, old in like.history.items()})
