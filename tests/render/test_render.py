@@ -601,10 +601,12 @@ def test_the_depth_of_a_screen_is_asked(monkeypatch, depth):
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
     )
+    display._of_x11.cache_clear()
     try:
         monkeypatch.setenv("DISPLAY", f":{server.stdout.readline().decode().strip()}")
         assert display.wrong_depth() == (None if depth == 24 else depth)
     finally:
+        display._of_x11.cache_clear()
         server.terminate()
         server.wait()
 
