@@ -183,7 +183,7 @@ def unpack_state(text: str, like: RehearsalState) -> RehearsalState:
         pose = _pose(arrays, "pose")
         resection = _resection(arrays, like.solver.body.position.shape)
     except UNREADABLE as error:
-        what = str(error) or type(error).__name__
+        what = str(error) or "damaged"
         raise StateError(f"a state that cannot be used ({what.splitlines()[0]})") from None
     return RehearsalState(now, watch, pose, steps, grip, resection)
 
