@@ -1,7 +1,7 @@
 """The files of a folder, without those that operating systems put there by themselves."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePath
 
 # Of macOS (AppleDouble files begin with ._) and Windows; also in archives and on media that they wrote.
@@ -18,9 +18,14 @@ def is_system_file(path: PurePath) -> bool:
     return any(part.startswith(APPLE_DOUBLE) or part.lower() in SYSTEM_NAMES for part in path.parts)
 
 
+def without_system_files(paths: Iterable[Path]) -> tuple[Path, ...]:
+    """The paths whose last part is no operating system's own: the shell's * gives these too."""
+    return tuple(path for path in paths if not is_system_file(Path(path.name)))
+
+
 def entries_of(folder: Path) -> list[Path]:
     """Files and folders in a folder, by name. Raises OSError."""
-    return sorted(path for path in folder.iterdir() if not is_system_file(Path(path.name)))
+    return sorted(without_system_files(folder.iterdir()))
 
 
 def files_below(folder: Path, unreadable: Callable[[OSError], object] | None = None) -> Iterator[Path]:

@@ -19,7 +19,7 @@ from rehearsal.planning.plan_file import write_plan
 from rehearsal.planning.sweep_trial import PlanningProblem
 from rehearsal.result_files import rounded, write_csv, write_json
 from rehearsal.worker_processes import Workers, error_of, has_ended
-from scenes.folder_files import is_system_file
+from scenes.folder_files import without_system_files
 from scenes.surfaces import volume_mm3
 from scenes.tissue import QUALITIES
 from studies.cohort.cohort_table import CohortFile, PatientRow, read_rows, text_of, write_rows
@@ -64,8 +64,7 @@ def cohort(
 
     FOLDER... are patients' folders or scene files. Started again with the same --out, it goes on where it was interrupted.
     """
-    # The shell's * also gives these.
-    folders = tuple(folder for folder in folders if not is_system_file(Path(folder.name)))
+    folders = without_system_files(folders)
     make_folder(out)
     earlier = read_rows(out)
     with tqdm(total=len(folders), desc="cohort", unit="patient") as bar:

@@ -394,8 +394,6 @@ def test_a_pose_of_a_session_that_is_none_is_named_by_its_line(tmp_path, pose):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("now.position", np.nan),
-        ("now.velocity", np.inf),
         ("grip.turn_deg", np.nan),
         ("grip.depth_mm", np.inf),
         ("numbers", np.inf),
@@ -412,6 +410,19 @@ def test_a_state_with_what_is_no_number_is_refused(tmp_path, name, value):
     with pytest.raises(StateError, match="cannot be used"):
         unpack_state(base64.b64encode(changed.getvalue()).decode(), numbers.settled)
     assert unpack_state(text, numbers.settled) is not None
+
+
+@pytest.mark.parametrize(("name", "value"), [("position", np.nan), ("velocity", np.inf)])
+def test_a_session_that_begins_with_tissue_that_is_not_finite_is_refused(tmp_path, name, value):
+    written(tmp_path / "session", 41)
+    log, numbers = read_log(tmp_path / "session"), Numbers()
+    state = numbers.snapshot()
+    body = state.solver.body
+    damaged = replace(body, **{name: np.full_like(getattr(body, name), value)})
+    state = replace(state, solver=replace(state.solver, body=damaged))
+    log.header = log.header.model_copy(update=dict(begins=pack_state(state)))
+    with pytest.raises(SessionError, match="a state of tissue that is not finite"):
+        Replay(numbers, log)
 
 
 class FullDisk(io.RawIOBase):
