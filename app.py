@@ -1,10 +1,41 @@
 """The command line. ``python app.py --help`` lists what it does."""
 
+import _thread
 import errno
 import gc
+import io
+import os
 import signal
 import sys
 import threading
+from types import FrameType
+
+# After a signal within an import: this long until it is tried again [s].
+IMPORT_S = 0.02
+
+
+def _stop(signum: int, frame: FrameType | None) -> None:
+    """Ctrl-C and SIGTERM: KeyboardInterrupt in a command, so that nothing incomplete remains; before and after it, the end.
+
+    Within a command's imports it is raised a moment later: modules that try what is installed catch it there, and go on without it.
+    """
+    stack = set()
+    while frame is not None:
+        stack.add((frame.f_globals.get("__name__"), frame.f_code.co_name))
+        frame = frame.f_back
+    if (__name__, "main") not in stack or ("rehearsal.commands.lazy_group", "get_command") in stack:
+        os.write(2, b"Stopped.\n")
+        os._exit(130)
+    if ("importlib._bootstrap", "_find_and_load") not in stack:
+        raise KeyboardInterrupt
+    later = threading.Timer(IMPORT_S, _thread.interrupt_main, [signum])
+    later.daemon = True
+    later.start()
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, _stop)
+    signal.signal(signal.SIGTERM, _stop)
 
 try:
     import click
@@ -14,9 +45,6 @@ except ModuleNotFoundError as missing:
         f"nephron: {missing.name} is not installed for this Python; run make run once, then use the Python of its environment: "
         ". .venv/bin/activate (Windows: .venv\\Scripts\\activate)"
     )
-except KeyboardInterrupt:
-    sys.stderr.write("Stopped.\n")
-    sys.exit(130)
 
 from errors import UserError
 from rehearsal.commands.lazy_group import LazyGroup
@@ -87,10 +115,11 @@ def cli() -> None:
     """
 
 
-def _stop_in_order() -> None:
-    """On SIGTERM, clean up as after Ctrl-C, so that no incomplete patient's folder remains."""
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+def _show_any_letter() -> None:
+    """Let output show what its encoding lacks, or a path that is not UTF-8, as backslashes instead of an error."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _file_error(error: OSError) -> str:
@@ -105,8 +134,8 @@ def main(arguments: list[str]) -> int:
     """Run a command line; what the user must mend is one line, and the exit status 2."""
     if not arguments or (arguments[0].startswith("-") and arguments[0] not in ("-h", "--help", "--version")):
         arguments = ["rehearse", *arguments]
-    _stop_in_order()
     try:
+        _show_any_letter()
         return cli.main(args=arguments, prog_name="app.py", standalone_mode=False) or 0
     except click.ClickException as error:
         message = error.format_message()

@@ -1,8 +1,12 @@
 """Errors that the user can correct, and their messages; used by all folders."""
 
 import difflib
+import gzip
 import reprlib
+import struct
 import warnings
+import zipfile
+import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -15,6 +19,24 @@ FOUND = reprlib.Repr()
 FOUND.maxlist, FOUND.maxstring = 4, 80
 # Wrong keys of a file that a message names besides the first.
 MOST_NAMED = 4
+
+
+# What errors of parsers mean, the special ones first.
+CAUSES: tuple[tuple[type[Exception], str], ...] = (
+    (EOFError, "it ends too early"),
+    (struct.error, "it ends too early"),
+    (zlib.error, "its compression is damaged"),
+    (gzip.BadGzipFile, "its compression is damaged"),
+    (zipfile.BadZipFile, "its end or list of files is damaged"),
+    (MemoryError, "the memory is full"),
+    (RecursionError, "it is nested too deeply"),
+    (NotImplementedError, "a form that is not supported"),
+    (UnicodeError, "a text of unknown encoding"),
+    (LookupError, "something is missing in it"),
+    (OverflowError, "a number that is too large"),
+    (ValueError, "a value that is not possible"),
+    (TypeError, "a value of another kind"),
+)
 
 
 class UserError(ValueError):
@@ -30,7 +52,10 @@ class PatientError(UserError):
 
 @contextmanager
 def parsing(what: str, advice: str) -> Iterator[None]:
-    """A library's parser raises many kinds of error: each becomes a PatientError. Its warnings, which may name the patient, are dropped."""
+    """A library's parser raises many kinds of error: each becomes a PatientError with its cause in words, where that is known.
+
+    Its own words and its warnings, which may name the patient, are dropped.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -38,7 +63,17 @@ def parsing(what: str, advice: str) -> Iterator[None]:
     except PatientError:
         raise
     except Exception as error:
-        raise PatientError(f"{what} ({type(error).__name__}); {advice}") from error
+        cause = _cause(error)
+        raise PatientError(f"{what}{f' ({cause})' if cause else ''}; {advice}") from error
+
+
+def _cause(error: Exception) -> str:
+    """What a parser's error means, without any text of the file; empty where its kind does not show it."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    if isinstance(error, AttributeError) and error.name:
+        return f"no {error.name}"
+    return next((words for kind, words in CAUSES if isinstance(error, kind)), "")
 
 
 def explained(

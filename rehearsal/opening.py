@@ -1,6 +1,7 @@
 """Open a rehearsal: read what the user names, build the model, and for a window start the process of its solver."""
 
 import gc
+import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from time import perf_counter
@@ -17,7 +18,7 @@ from rehearsal.real_time.pace import Pace
 from rehearsal.real_time.start_times import StartTimes
 from rehearsal.real_time.started_process import StartedProcess
 from rehearsal.tracking.openigtlink_options import open_link
-from render.display import window_size
+from render.display import window_size, wrong_depth
 from render.gamepad import Gamepad, SdlPads
 from render.keys import Keys
 from scenes.anatomy import LoadedAnatomy, load_anatomy
@@ -48,7 +49,7 @@ def opened(asked: RehearseOptions, process: StartedProcess | None) -> Iterator["
         start.begin("Taichi")
         solver = None if process is None else resources.enter_context(solver_process(process))
         if solver is not None:
-            check_vulkan()
+            check_graphics()
         make_folder(asked.out)
         arch = start_taichi(asked.arch)
         link = open_link(asked)
@@ -159,10 +160,15 @@ def built_for_window(
     return rehearsal
 
 
-def check_vulkan() -> None:
-    """Raises CommandError if a window has no Vulkan driver, before minutes are spent on building the model."""
+def check_graphics() -> None:
+    """Raises CommandError if no window can be opened: screen or driver; before minutes are spent on building the model."""
     from sim.device import is_available
 
+    if depth := wrong_depth():
+        raise CommandError(
+            f"the display {os.environ.get('DISPLAY')} has {depth} bits of colour; expected 24, with others the graphics driver would "
+            "end the program; set the screen to 24 bits, or run with --headless"
+        )
     if not is_available("vulkan"):
         raise CommandError(
             "no Vulkan driver found: the window needs one; install a Vulkan driver, or run with --headless"

@@ -5,6 +5,7 @@ import os
 import re
 import sys
 from functools import cache
+from typing import NamedTuple
 
 from render.window_layout import FULL_SIZE, MOST_SCALE
 
@@ -12,6 +13,17 @@ from render.window_layout import FULL_SIZE, MOST_SCALE
 HEIGHT_FRACTION, STEP = 0.88, 64
 # Dots per inch at scale 1.
 USUAL_DPI = 96
+# Bits of colour of a screen on which a window can be opened: with 16 or 30, the drivers end the process.
+DEPTHS = (24, 32)
+
+
+class X11Screen(NamedTuple):
+    """A screen's size [pixels], its scale, and its bits of colour."""
+
+    width: int
+    height: int
+    scale: float
+    depth: int
 
 
 def display_available() -> bool:
@@ -19,11 +31,18 @@ def display_available() -> bool:
     return sys.platform in ("win32", "darwin") or _of_x11(os.environ.get("DISPLAY")) is not None
 
 
+def wrong_depth() -> int | None:
+    """Return the screen's bits of colour, where no window can be opened on it for them."""
+    screen = None if sys.platform in ("win32", "darwin") else _of_x11(os.environ.get("DISPLAY"))
+    return None if screen is None or screen.depth in DEPTHS else screen.depth
+
+
 def window_size() -> tuple[int, int]:
     """Return width and height of a window [pixels] that fit the screen; FULL_SIZE where it is unknown."""
     screen = _of_windows()
     if sys.platform not in ("win32", "darwin"):
-        screen = _of_x11(os.environ.get("DISPLAY"))
+        of_x11 = _of_x11(os.environ.get("DISPLAY"))
+        screen = of_x11 and of_x11[:3]
     return FULL_SIZE if screen is None else fitted(*screen)
 
 
@@ -46,8 +65,8 @@ def _of_windows() -> tuple[int, int, float] | None:
 
 
 @cache
-def _of_x11(display: str | None) -> tuple[int, int, float] | None:
-    """Return width, height and scale of an X server's screen. Cached: a server without clients may reset when asked again."""
+def _of_x11(display: str | None) -> X11Screen | None:
+    """Return an X server's screen. Cached: a server without clients may reset when asked again."""
     if not display:
         return None
     try:
@@ -62,9 +81,10 @@ def _of_x11(display: str | None) -> tuple[int, int, float] | None:
     server = ctypes.c_void_p(connection)
     screen = x11.XDefaultScreen(server)
     scale = scale_of(x11.XResourceManagerString(server) or b"")
-    size = x11.XDisplayWidth(server, screen), x11.XDisplayHeight(server, screen), scale
+    size = x11.XDisplayWidth(server, screen), x11.XDisplayHeight(server, screen)
+    depth = x11.XDefaultDepth(server, screen)
     x11.XCloseDisplay(server)
-    return size
+    return X11Screen(*size, scale, depth)
 
 
 def scale_of(resources: bytes) -> float:

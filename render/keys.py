@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from errors import UserError, explained, meant
 from render.viewer import TECHNIQUES, Controls
+from text_files import read_text
 from ultrasound.probe import DETAIL_LEVELS, DOPPLER_MODES, MODES
 from ultrasound.target import TARGETS
 
@@ -174,7 +175,7 @@ class Keys:
 def load_keys(path: Path) -> Keys:
     """Return the keys of a TOML file, with defaults for those it leaves out. Raises KeysError."""
     try:
-        given = _File.model_validate(tomllib.loads(path.read_text("utf-8")))
+        given = _File.model_validate(tomllib.loads(read_text(path)))
     except FileNotFoundError:
         raise KeysError(f"{path}: no such key file; app.py keys prints one to start from") from None
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

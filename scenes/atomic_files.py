@@ -1,7 +1,8 @@
-"""Atomic writes: a file or folder appears complete, or not at all."""
+"""Atomic writes: a file or folder appears complete, or not at all; and names of files for libraries that crash on some."""
 
 import glob
 import os
+import re
 import secrets
 import shutil
 import tempfile
@@ -9,7 +10,31 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import psutil
+
 from errors import PatientError
+
+# The process that writes a temporary file or folder, in its name.
+WRITER = re.compile(r"\.(\d+)-[0-9a-f]+\.partial-")
+
+
+@contextmanager
+def plain_path(path: Path, *beside: Path) -> Iterator[str]:
+    """A file's name for a library that ends the process where one is not UTF-8: the same, or that of a link to it.
+
+    ``beside``: other files that the file names. A file that is written need not exist. Raises OSError.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        with tempfile.TemporaryDirectory(prefix="nephron-") as folder:
+            link = Path(folder, f"file{path.suffix}")
+            link.symlink_to(path.absolute())
+            for other in beside:
+                Path(folder, other.name).symlink_to(other.absolute())
+            yield str(link)
+    else:
+        yield str(path)
 
 
 def check_writable(folder: Path) -> None:
@@ -24,7 +49,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
     The caller creates a folder itself; ``path`` must not exist, or be an empty folder. Raises OSError, which names the path.
     """
-    partial = path.with_name(f".{secrets.token_hex(4)}.partial-{path.name}")
+    partial = path.with_name(f".{os.getpid()}-{secrets.token_hex(4)}.partial-{path.name}")
     try:
         yield partial
         if partial.is_dir() and path.exists():  # Windows does not replace a folder
@@ -43,15 +68,23 @@ def atomic_write(path: Path) -> Iterator[Path]:
 def new_folder(folder: Path) -> Iterator[Path]:
     """Yield an empty folder to write to; it becomes ``folder`` when all files are written. Raises PatientError."""
     check_folder(folder)
-    for left in folder.parent.glob(f".*.partial-{glob.escape(folder.name)}"):  # by a run that was killed
-        shutil.rmtree(left, ignore_errors=True)
+    for left in folder.parent.glob(f".*.partial-{glob.escape(folder.name)}"):
+        if not _is_being_written(left):
+            shutil.rmtree(left, ignore_errors=True)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(folder) as partial:
             partial.mkdir()
             yield partial
     except OSError as error:
+        check_folder(folder)  # another run may have made it meanwhile
         raise PatientError(f"{folder}: {error.strerror}; choose a folder that can be written") from error
+
+
+def _is_being_written(partial: Path) -> bool:
+    """Whether a temporary folder is of a run that goes on, on this machine; not of one that was killed."""
+    writer = WRITER.match(partial.name)
+    return writer is not None and psutil.pid_exists(int(writer[1]))
 
 
 def check_folder(folder: Path) -> None:

@@ -12,6 +12,7 @@ from scenes.patient_space import Space
 from scenes.scene import Scene, SceneError
 from scenes.section import Section, Vector3
 from scenes.terminal import shell_command
+from text_files import read_text
 
 FINDINGS_FILE = "import.json"
 
@@ -90,7 +91,7 @@ def read_findings(folder: Path) -> ImportFindings | None:
     """The findings in a patient's folder; None where there are none, as before version 2. Raises SceneError."""
     path = folder / FINDINGS_FILE
     try:
-        return ImportFindings.model_validate_json(path.read_bytes())
+        return ImportFindings.model_validate_json(read_text(path))
     except FileNotFoundError:
         return None
     except OSError as error:

@@ -16,6 +16,7 @@ from pydantic import AliasChoices, Field, ValidationError, model_validator
 from errors import UserError, explained, meant
 from scenes.section import LIST, Direction, Length, Section, Vector3
 from scenes.tissue import TISSUES, NeoHookeanTissue, Tissue
+from text_files import read_text
 from version import FORMAT, of_this_format
 
 # The scene of the embedded patient.
@@ -308,11 +309,11 @@ def load_scene(path: Path) -> Scene:
         if path.name.lower().endswith(ends) and path.is_file():
             raise SceneError(f"{path}: is {what}; {EXPECTED}")
     try:
-        values = tomllib.loads(path.read_text("utf-8"))
+        values = tomllib.loads(read_text(path))
     except FileNotFoundError:
         raise SceneError(f"{path}: no such scene file or patient's folder") from None
     except UnicodeDecodeError:
-        raise SceneError(f"{path}: is not a text file; {EXPECTED}") from None
+        raise SceneError(f"{path}: is not text in UTF-8; {EXPECTED}; save it as UTF-8") from None
     except (OSError, tomllib.TOMLDecodeError) as error:
         raise SceneError(
             f"{path}: cannot be read as TOML ({str(error).splitlines()[0]}); {EXPECTED}"

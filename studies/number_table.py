@@ -7,26 +7,27 @@ from pathlib import Path
 import numpy as np
 
 from errors import UserError
+from text_files import read_text, table_rows
 
 
 def read_numbers(path: Path, columns: Sequence[str], error_type: type[UserError]) -> np.ndarray:
     """Values (rows, columns) of the named columns. Raises ``error_type`` for a file, a column or a value that is not valid."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file, skipinitialspace=True))
+        heads, *lines = table_rows(read_text(path)) or [[]]
+        rows = [dict(zip(heads, line, strict=False)) for line in lines]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise error_type(f"{path}: cannot be read ({error}); expected a table in CSV") from None
     if not rows:
         raise error_type(f"{path}: has no rows; expected a header and one line a row")
-    missing = [name for name in columns if name not in rows[0]]
+    missing = [name for name in columns if name not in heads]
     if missing:
         raise error_type(
             f"{path}: column {missing[0]} is missing; expected {len(columns)} columns, {columns[0]} to {columns[-1]}"
         )
-    values = [[_number(row[name]) for name in columns] for row in rows]
+    values = [[_number(row.get(name)) for name in columns] for row in rows]
     numbers = np.array(values)
     for row, column in np.argwhere(~np.isfinite(numbers)):
-        text = rows[row][columns[column]]
+        text = rows[row].get(columns[column])
         raise error_type(f"{path}: line {row + 2}, {columns[column]} is {text!r}: expected a finite number")
     return numbers
 

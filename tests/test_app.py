@@ -4,8 +4,11 @@ import errno
 import io
 import json
 import os
+import shutil
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import redirect_stderr
 from functools import partial
@@ -19,11 +22,13 @@ import SimpleITK as sitk
 import trimesh
 from conftest import ROOT
 from PIL import Image
+from synthetic_body import body
 
 import app
 from rehearsal.commands.command_line import CommandError
 from rehearsal.commands.rehearse_command import why_no_display
 from rehearsal.commands.rehearse_options import RehearseOptions
+from render.display import X11Screen
 from studies.study_command import STUDIES
 from version import VERSION
 
@@ -156,6 +161,15 @@ def test_a_window_without_vulkan_is_refused_before_anything_is_built(monkeypatch
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="of X11")
+@pytest.mark.parametrize("depth", [16, 30])
+def test_a_screen_on_which_a_driver_would_end_the_process_is_refused(monkeypatch, tmp_path, depth):
+    monkeypatch.setattr("render.display._of_x11", lambda name: X11Screen(1920, 1080, 1.0, depth))
+    monkeypatch.setattr("sim.device.is_available", lambda arch: True)
+    assert f"has {depth} bits of colour; expected 24" in refused("rehearse", "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_python_without_the_packages_is_one_line():
     bare = [sys.executable, "-S", str(ROOT / "app.py"), "--version"]
     done = subprocess.run(bare, capture_output=True, text=True, cwd=ROOT, timeout=60)
@@ -164,7 +178,7 @@ def test_a_python_without_the_packages_is_one_line():
 
 
 def test_ctrl_c_ends_it_in_words(tmp_path, monkeypatch, capsys):
-    (tmp_path / "click.py").write_text("raise KeyboardInterrupt")
+    (tmp_path / "click.py").write_text("import os, signal; os.kill(os.getpid(), signal.SIGINT)")
     done = run("--version", PYTHONPATH=str(tmp_path))
     assert (done.returncode, done.stderr) == (130, "Stopped.\n")
 
@@ -174,6 +188,71 @@ def test_ctrl_c_ends_it_in_words(tmp_path, monkeypatch, capsys):
     for by, words in ((KeyboardInterrupt(), "Stopped."), (click.exceptions.Exit(130), "")):
         monkeypatch.setattr("rehearsal.commands.rehearse_command.keys_text", partial(ends, by))
         assert app.main(["keys"]) == 130 and capsys.readouterr().err.strip() == words
+
+
+@pytest.fixture(scope="module")
+def volumes(tmp_path_factory) -> tuple[Path, Path]:
+    """A CT and its labels."""
+    folder = tmp_path_factory.mktemp("volumes")
+    for name, image in zip(("ct", "labels"), body(), strict=True):
+        sitk.WriteImage(image, str(folder / f"{name}.nrrd"))
+    return folder / "ct.nrrd", folder / "labels.nrrd"
+
+
+# Seconds after the start of Python; the modules are loaded until 1 to 3 s.
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("after_s", [0.3, 0.9, 2.0])
+def test_an_import_that_is_stopped_ends_in_words_and_leaves_nothing(volumes, tmp_path, kind, after_s):
+    begun = "import runpy, sys; print(flush=True); sys.argv[0] = 'app.py'; runpy.run_path('app.py', run_name='__main__')"
+    wanted = "import", *volumes, "--organ", "2", "--tumour", "3", "--out", tmp_path / "out"
+    program = subprocess.Popen(
+        [sys.executable, "-c", begun, *map(str, wanted)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        cwd=ROOT,
+    )
+    program.stdout.readline()
+    time.sleep(after_s)
+    program.send_signal(kind)
+    told = program.communicate(timeout=60)[1].decode()
+    assert (program.returncode, told.strip()) == (130, "Stopped.") and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("swallows", ["except BaseException: pass", "finally: sys.exit"])
+def test_a_module_that_catches_all_does_not_catch_ctrl_c(tmp_path, swallows):
+    """As one does that looks for libraries, and goes on without them."""
+    swallowing = f"import os, signal, sys\ntry:\n os.kill(os.getpid(), signal.SIGINT)\n{swallows}\n"
+    (tmp_path / "matplotlib.py").write_text(swallowing)
+    done = run("study", "stability", "--quick", "--out", tmp_path / "out", PYTHONPATH=str(tmp_path))
+    assert (done.returncode, done.stderr.strip()) == (130, "Stopped.")
+
+
+@pytest.mark.parametrize(
+    ("encoding", "shown"), [("ascii", "Ω – µ".encode()), ("cp1252", b"\\u03a9 \x96 \xb5")]
+)
+def test_output_shows_what_its_encoding_lacks_in_another_form(volumes, tmp_path, encoding, shown):
+    named = shutil.copy(volumes[1], tmp_path / "Ω – µ.nrrd")
+    nowhere = tmp_path / os.fsdecode(b"\xce\xa9 \xe9")
+    for labels, status in ((named, 0), (nowhere, 2)):
+        done = subprocess.run(
+            [sys.executable, str(ROOT / "app.py"), "import", "--list", volumes[0], labels],
+            capture_output=True,
+            env=os.environ | {"PYTHONIOENCODING": encoding},
+            cwd=ROOT,
+        )
+        assert done.returncode == status and b"Traceback" not in done.stderr, done.stderr
+        assert shown in done.stdout if status == 0 else b"no such file" in done.stderr
+
+
+@pytest.mark.parametrize("command", [("keys",), ("import", "--help")])
+def test_a_closed_pipe_ends_it_without_a_traceback(command):
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "app.py"), *command], stdout=writing, stderr=subprocess.PIPE, cwd=ROOT
+    )
+    os.close(writing)
+    assert done.returncode == 1 and done.stderr == b""
 
 
 @pytest.mark.parametrize("command", [(), ("rehearse",), ("import",), ("validate",), ("calibrate",)])

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic.alias_generators import to_pascal
 
 from errors import UserError, explained, meant
+from text_files import read_text
 from ultrasound.pulse import DB_OF_NEPER, PATH_STEP, SOUND_MM_US, AttenuatedPulse, attenuated_pulse
 
 PROBES = Path(__file__).parent / "probes"
@@ -298,7 +299,7 @@ def load_probe(name: str) -> Probe:
     built_in = PROBES / f"{name}.toml"
     path = built_in if built_in.is_file() else Path(name)
     try:
-        return probe_of_values(tomllib.loads(path.read_text("utf-8")))
+        return probe_of_values(tomllib.loads(read_text(path)))
     except FileNotFoundError:
         known = ", ".join(sorted(each.stem for each in PROBES.glob("*.toml")))
         raise ProbeError(f"transducer.probe: {name!r} is no file, and known by name are {known}") from None

@@ -6,6 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from errors import FOUND
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.notices import Notices
 from rehearsal.pressed_organ import Step
@@ -159,7 +160,7 @@ def set_settings(settings: Settings, values: dict[str, Any]) -> None:
     for name, value in values.items():
         if name not in known or not _fits(getattr(settings, name), value, name, known[name]):
             raise SessionError(
-                f"the session sets {name} to {value!r}, which it cannot be: its file is damaged"
+                f"the session sets {name} to {FOUND.repr(value)}, which it cannot be: its file is damaged"
             )
         setattr(settings, name, value)
 

@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from errors import UserError, explained
+from text_files import read_text
 
 
 class UncertaintyError(UserError):
@@ -59,7 +60,7 @@ def read_bands(path: Path) -> UncertaintyBands:
     """Read uncertainty.json. Raises UncertaintyError that names the file and what to do."""
     again = "make it with: app.py study uncertainty"
     try:
-        return UncertaintyBands.model_validate(json.loads(path.read_text("utf-8")))
+        return UncertaintyBands.model_validate(json.loads(read_text(path)))
     except FileNotFoundError:
         raise UncertaintyError(
             f"{path}: no such file, which the scene names as uncertainty; {again}"

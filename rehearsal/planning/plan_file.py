@@ -23,6 +23,7 @@ from rehearsal.result_files import next_number
 from rehearsal.tracking.pose_file import Pose, TimedPoses
 from scenes.atomic_files import atomic_write
 from scenes.scene import Trocar
+from text_files import read_text
 from ultrasound.target import Target
 from version import FORMAT, of_this_format
 
@@ -32,7 +33,7 @@ MOST_SWEEPS = 2
 SLOWEST_MM_S, FASTEST_MM_S = 1.0, 100.0
 NAME = r"plan-([0-9]{3,9})\.json"
 # The first bytes of a plan contain this.
-MARK = b'"nephron_plan"'
+MARK = '"nephron_plan"'
 # Before and after a pass the probe is lifted by this, and moves at this speed.
 LIFT_MM, LIFTED_MM_S = 6.0, 60.0
 # The time before the first pass, to come above its first pose from anywhere.
@@ -127,22 +128,23 @@ def next_plan_path(folder: Path) -> Path:
 def is_plan(path: Path) -> bool:
     """Whether a file begins as a plan does."""
     try:
-        return MARK in path.read_bytes()[:100]
-    except OSError:
+        return MARK in read_text(path)[:100]
+    except (OSError, UnicodeDecodeError):
         return False
 
 
 def read_plan(path: Path) -> Plan:
     """Read a plan. Raises PlanError."""
     try:
-        return Plan.model_validate_json(path.read_bytes())
+        return Plan.model_validate_json(read_text(path))
     except FileNotFoundError:
         raise PlanError(f"{path}: no such plan; make one with: app.py plan SCENE --out {path.name}") from None
     except OSError as error:
         raise PlanError(f"{path}: cannot be read as a plan ({error.strerror})") from None
-    except ValidationError as error:
+    except (ValidationError, UnicodeDecodeError) as error:
+        what = explained(error) if isinstance(error, ValidationError) else "invalid JSON"
         raise PlanError(
-            f"{path}: not a plan of this version ({explained(error)}); expected a file that app.py plan wrote"
+            f"{path}: not a plan of this version ({what}); expected a file that app.py plan wrote"
         ) from None
 
 

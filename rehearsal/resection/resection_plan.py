@@ -21,10 +21,11 @@ from rehearsal.resection.proposal import Proposal, cost_ml
 from rehearsal.resection.script import Number
 from render.viewer import Technique
 from scenes.atomic_files import atomic_write
+from text_files import read_text
 from version import FORMAT, of_this_format
 
 # The first bytes of a plan contain this.
-MARK = b'"nephron_resection"'
+MARK = '"nephron_resection"'
 # Figures of a cut that are compared with those of the plan: how they are called, and their units.
 COMPARED = {
     "parenchyma_removed_ml": ("parenchyma", "ml"),
@@ -136,20 +137,21 @@ def write_resection_plan(plan: ResectionPlan, path: Path) -> None:
 def is_resection_plan(path: Path) -> bool:
     """Whether a file begins as a plan of a resection does."""
     try:
-        return MARK in path.read_bytes()[:100]
-    except OSError:
+        return MARK in read_text(path)[:100]
+    except (OSError, UnicodeDecodeError):
         return False
 
 
 def read_resection_plan(path: Path) -> ResectionPlan:
     """Read a plan. Raises ResectionPlanError."""
     try:
-        return ResectionPlan.model_validate_json(path.read_bytes())
+        return ResectionPlan.model_validate_json(read_text(path))
     except OSError as error:
         raise ResectionPlanError(
             f"{path}: cannot be read as a plan of a resection ({error.strerror})"
         ) from None
-    except ValidationError as error:
+    except (ValidationError, UnicodeDecodeError) as error:
+        what = explained(error) if isinstance(error, ValidationError) else "invalid JSON"
         raise ResectionPlanError(
-            f"{path}: not a plan of a resection of this version ({explained(error)}); expected a file that app.py plan --resect wrote"
+            f"{path}: not a plan of a resection of this version ({what}); expected a file that app.py plan --resect wrote"
         ) from None

@@ -34,7 +34,7 @@ LEAST_STEP_S, MOST_STEP_S = 1e-6, 10.0
 
 # What NumPy and zipfile raise for unreadable data.
 UNREADABLE = (
-    *(ValueError, LookupError, TypeError, RuntimeError, OSError, EOFError, MemoryError),
+    *(ValueError, LookupError, TypeError, RuntimeError, OSError, EOFError, MemoryError, ArithmeticError),
     *(zipfile.BadZipFile, zlib.error, struct.error),
 )
 
@@ -177,11 +177,13 @@ def unpack_state(text: str, like: RehearsalState) -> RehearsalState:
         turn = tuple(map(float, arrays["grip.turn_deg"].reshape(3)))
         depth, pressed = float(arrays["grip.depth_mm"]), float(arrays["grip.pressed_mm"])
         aim = _pose(arrays, "grip.aim") if "grip.aim" in arrays else None
+        if not np.isfinite([*turn, depth, pressed]).all():
+            raise StateError("a manipulator that is not finite")
         grip = ManipulatorState(depth, pressed, turn, aim)  # type: ignore[arg-type]
         pose = _pose(arrays, "pose")
         resection = _resection(arrays, like.solver.body.position.shape)
     except UNREADABLE as error:
-        what = str(error) or type(error).__name__
+        what = str(error) or "damaged"
         raise StateError(f"a state that cannot be used ({what.splitlines()[0]})") from None
     return RehearsalState(now, watch, pose, steps, grip, resection)
 

@@ -187,9 +187,13 @@ class Replay:
 
     def _state(self, text: str) -> RehearsalState:
         try:
-            return unpack_state(text, self.rehearsal.settled)
+            state = unpack_state(text, self.rehearsal.settled)
         except StateError as error:
             raise SessionError(f"the session holds {error}: it is damaged, or of another body") from None
+        bodies = state.solver.body, state.divergence.good.body
+        if not all(np.isfinite(values).all() for body in bodies for values in (body.position, body.velocity)):
+            raise SessionError("the session holds a state of tissue that is not finite: its file is damaged")
+        return state
 
 
 def set_solver(rehearsal: Rehearsal, values: dict[str, Any]) -> None:

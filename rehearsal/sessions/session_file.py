@@ -15,13 +15,22 @@ from typing_extensions import TypedDict
 
 from errors import FOUND, UserError, explained
 from rehearsal.resection.resection_state import MOST_MARKS
-from rehearsal.sessions.packed_arrays import Seen, SeenVoxels, unpack_lengths, unpack_poses
+from rehearsal.sessions.packed_arrays import (
+    LEAST_STEP_S,
+    MOST_STEP_S,
+    Seen,
+    SeenVoxels,
+    unpack_lengths,
+    unpack_poses,
+)
 from render.viewer import Technique
 from scenes.scene import Scene
 from ultrasound.crater import Filling
 from version import FORMAT, of_this_format
 
 MOST_FILE_BYTES = 2_000_000_000
+# Of a pose: how far its axes are from right angles, and its place from the origin [mm].
+RIGID, MOST_MM = 1e-3, 1e4
 # The parts of a scene that belong to the patient's folder and may name files.
 PATIENTS: dict[str, Any] = {
     **{"anatomy": True, "shape": True, "title": True, "uncertainty": True},
@@ -48,7 +57,7 @@ class Header(_Line):
     scene: dict[str, Any]
     probe: dict[str, Any]
     arch: str = Field(pattern=r"^[0-9a-z_]{1,20}$")
-    time_step_s: float = Field(gt=0)
+    time_step_s: float = Field(ge=LEAST_STEP_S, le=MOST_STEP_S)
     begins: str | None = None
     """The state that it begins with, where that is not the settled one."""
 
@@ -190,6 +199,11 @@ def read_log(path: Path) -> Log:
             raise SessionError(
                 f"{name}: line {number} does not follow the line before it: one is missing or damaged"
             )
+        if not _are_rigid(poses):
+            raise SessionError(
+                f"{name}: line {number} has a pose that is none of a probe: expected right-angled axes of length 1, and a place within "
+                f"{MOST_MM:g} mm; what comes before it can be had by deleting from it on"
+            )
         parts.append(poses)
         lengths.append(lengths_s)
         for event in second.events:
@@ -202,6 +216,14 @@ def read_log(path: Path) -> Log:
     log.poses = np.concatenate([log.poses, *parts])
     log.lengths_s = np.concatenate([log.lengths_s, *lengths])
     return log
+
+
+def _are_rigid(poses: np.ndarray) -> bool:
+    """Whether poses (n, 4, 4), NaN for a rollback, are rotations with a translation."""
+    poses = poses[~np.isnan(poses).any(axis=(1, 2))]
+    axes, places = poses[:, :3, :3], poses[:, :3, 3]
+    off = np.abs(axes.transpose(0, 2, 1) @ axes - np.eye(3))
+    return not ((off > RIGID).any() or (np.linalg.det(axes) < 0).any() or (np.abs(places) > MOST_MM).any())
 
 
 def _lengths_of(second: Second, steps: int, usual_s: float) -> np.ndarray:

@@ -17,7 +17,7 @@ from time import monotonic
 
 import numpy as np
 from pyigtl import ImageMessage, StringMessage, TransformMessage
-from pyigtl.messages import MessageBase
+from pyigtl.messages import CRC64, MessageBase
 from scipy.linalg import polar
 
 from rehearsal.coordinates import probe_in_patient
@@ -33,6 +33,10 @@ FORCE = "ProbeForce"
 # Its own inverse.
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 HEADER_VERSIONS = (1, 2)
+# Type and name of a message, in bytes of its header: texts that end at the first NUL; what follows them may be anything.
+TEXTS = slice(2, 14), slice(14, 34)
+# The header's last number; some programs send 0 instead of computing it.
+CHECKSUM_BYTES = 8
 # A transform is 48 bytes, plus metadata.
 TRANSFORM_BYTES, CHUNK_BYTES = 1 << 16, 1 << 16
 # Not ProbeToReference: that is sent out, and a client with both could not tell them apart.
@@ -79,7 +83,8 @@ class ReceivedPose:
 
 
 class OpenIGTLinkServer:
-    """Sends the newest image to each client; ``received_pose`` is the pose that clients send.
+    """Sends the newest image to each client; ``received_pose`` is the pose that clients send, ``damaged_messages`` counts what had a
+    wrong checksum.
 
     One thread packs, sends and reads; a slow client skips images. Listens from the start, on a free port where ``port`` is 0; raises
     OSError where it cannot, UnicodeError for a text that cannot be a host's name. As a context manager it closes at the end.
@@ -88,6 +93,7 @@ class OpenIGTLinkServer:
     def __init__(self, host: str, port: int, message: Callable[[str], None]) -> None:
         self.received_pose = ReceivedPose(message)
         self._message, self._has_refused = message, False
+        self.damaged_messages = 0
         self._newest: tuple[MessageBase, ...] = ()
         self._loop = asyncio.new_event_loop()
         # Set when there is a newer image, and replaced by one for the next.
@@ -143,6 +149,8 @@ class OpenIGTLinkServer:
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
+        if self.damaged_messages > 1:
+            self._message(f"{self.damaged_messages} damaged messages of the link were ignored")
 
     async def _shut(self) -> None:
         self._server.close()
@@ -160,7 +168,9 @@ class OpenIGTLinkServer:
         """One client, until it leaves or sends what is no message."""
         both = [asyncio.create_task(each) for each in (self._send_to(writer), self._read_from(reader))]
         try:
-            await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
+            # asyncio prints a traceback for a client that ends cancelled.
+            with suppress(asyncio.CancelledError):
+                await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
         finally:
             for each in both:
                 each.cancel()
@@ -193,7 +203,7 @@ class OpenIGTLinkServer:
         """Take the next message; all but transforms are skipped. Raises MessageError, EOFError, OSError."""
         header = await reader.readexactly(MessageBase.IGTL_HEADER_SIZE)
         try:
-            fields = MessageBase.parse_header(header)
+            fields = MessageBase.parse_header(_without_rests(header))
         except UnicodeDecodeError as error:
             raise MessageError("a name that is not text") from error
         size = fields["body_size"]
@@ -208,12 +218,28 @@ class OpenIGTLinkServer:
         if size > TRANSFORM_BYTES:
             raise MessageError(f"a transform of {size} bytes: expected at most {TRANSFORM_BYTES}")
         body, message = await reader.readexactly(size), TransformMessage()
+        if int.from_bytes(header[-CHECKSUM_BYTES:]) not in (0, CRC64(body)):
+            self.damaged_messages += 1
+            if self.damaged_messages == 1:
+                self._message(
+                    "Warning: a message of the link is damaged (wrong checksum): it is ignored, as are more like it; check the program "
+                    "that sends it, and the network"
+                )
+            return
         try:
             message.unpack(fields, body)
         except Exception as error:  # pyigtl's readers raise whatever their parsers do
             raise MessageError("a transform that cannot be read") from error
         if fields["device_name"] == HAND_TO_REFERENCE:
             self.received_pose.take(message.matrix)
+
+
+def _without_rests(header: bytes) -> bytes:
+    """A header without what follows the NUL of a text."""
+    cleared = bytearray(header)
+    for part in TEXTS:
+        cleared[part] = header[part].partition(b"\0")[0].ljust(part.stop - part.start, b"\0")
+    return bytes(cleared)
 
 
 def send_live(

@@ -1,5 +1,6 @@
 """Files of probe poses: for the images of ``scan``, and as a path that a rehearsal follows."""
 
+import csv
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, 
 
 from errors import UserError
 from rehearsal.resection.script import Number, ScriptedAction, ScriptedCut
+from text_files import read_text, table_rows
 from ultrasound.probe_manipulator import interpolated
 
 # Tolerance of orthonormal axes: more than the rounding of six digits in a file or of a float32, less than a scaled matrix.
@@ -152,7 +154,7 @@ def load_timed_poses(path: Path) -> TimedPoses:
 
 def _read(path: Path) -> list[_FilePose]:
     try:
-        text = path.read_text("utf-8")
+        text = read_text(path)
         if not text.strip():
             raise PoseError(f"{path}: is empty; expected a list of poses")
         is_csv = path.suffix.lower() == ".csv"
@@ -163,6 +165,8 @@ def _read(path: Path) -> list[_FilePose]:
         raise PoseError(f"{path}: no such pose file") from None
     except UnicodeDecodeError:
         raise PoseError(f"{path}: is not text; {EXPECTED}") from None
+    except csv.Error as error:
+        raise PoseError(f"{path}: not valid CSV: {error}; {EXPECTED}") from None
     except OSError as error:
         raise PoseError(f"{path}: cannot be read as poses ({error.strerror})") from None
     except json.JSONDecodeError as error:
@@ -183,11 +187,13 @@ def _read(path: Path) -> list[_FilePose]:
 
 def _of_csv(path: Path, text: str) -> list[dict[str, Any]]:
     """The poses as JSON has them, their numbers as text."""
-    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    rows = [line.replace(";", ",").split(",") for line in lines]
+    rows = table_rows(text)
     for number, row in enumerate(rows, 1):
         if len(row) not in (16, 17) or len(row) != len(rows[0]):
-            raise PoseError(f"{path}: pose {number}: {len(row)} numbers; expected {SIXTEEN}, as in each line")
+            raise PoseError(
+                f"{path}: pose {number}: {len(row)} numbers; expected {SIXTEEN}, as in each line, separated by commas, or by "
+                "semicolons where there are decimal commas"
+            )
     poses = [dict(probe_to_patient=np.reshape(row[-16:], (4, 4)).tolist()) for row in rows]
     return [
         pose | ({"time_s": row[0]} if len(row) == 17 else {}) for pose, row in zip(poses, rows, strict=True)

@@ -23,6 +23,11 @@ def load_track(path: Path, name: str | None = None) -> TimedPoses:
     """
     if path.suffix.lower() in (".mha", ".nrrd"):
         return _sweep_poses(path, name or PROBE_IN_PATIENT)
+    if path.suffix.lower() in (".mhd", ".nhdr"):
+        raise SweepError(
+            f"{path.name}: is a header whose images are in another file; expected a sweep in one file (.igs.mha, .igs.nrrd), a plan, or "
+            "poses with times (.json, .csv); save it as .igs.mha, as PLUS and 3D Slicer do"
+        )
     if name is not None:
         raise PoseError(
             f"--track-from {name}: names a transform of a sweep, and {path.name} is not a sweep (.igs.mha, .igs.nrrd); leave it out"

@@ -31,6 +31,10 @@ def listing_text(
     """
     listed = list_ct(ct, progress, space)
     faults = [f"series {_name(row)} cannot be imported: {row.fault}" for row in listed.series if row.fault]
+    if listed.unreadable:
+        faults.append(
+            f"{listed.unreadable} subfolders cannot be read: series may be incomplete; check their permissions"
+        )
     parts = [_series_table(listed), "\n".join(faults), _labels_table(listed.labels)]
     parts += [_labels_text(path, progress, space) for path in labels]
     return "\n\n".join(filter(None, parts))

@@ -9,6 +9,7 @@ import numpy as np
 import SimpleITK as sitk
 
 from errors import PatientError, parsing
+from scenes.atomic_files import plain_path
 from scenes.patient_space import Space
 from scenes.volumes.lazy_volume import LazyVolume, check_size, no_orientation, no_scalar
 from scenes.volumes.voxel_grid import Box, VoxelGrid, check_3d
@@ -28,8 +29,12 @@ def itk_volume(path: Path, vectors: bool = False, space: Space | None = None) ->
     is_nrrd = path.suffix.lower() in NRRD
     reader = sitk.ImageFileReader()
     reader.SetImageIO("NrrdImageIO" if is_nrrd else "MetaImageIO")
-    reader.SetFileName(str(path))
-    with parsing(f"{path}: cannot be read as an image", "expected a whole file; copy or export it again"):
+    failed = f"{path}: cannot be read as an image"
+    with (
+        plain_path(path, data_file) as name,
+        parsing(failed, "expected a whole file; copy or export it again"),
+    ):
+        reader.SetFileName(name)
         reader.ReadImageInformation()
     check_3d(str(path), reader.GetSize())
     missing = _missing_orientation(path, reader)
@@ -44,7 +49,7 @@ def itk_volume(path: Path, vectors: bool = False, space: Space | None = None) ->
     if (components != 1 and not vectors) or "complex" in kind:
         raise no_scalar(path, kind)
     metadata = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys() if key.isprintable()}
-    return LazyVolume(str(path), grid, partial(_itk_box, path), space=assumed, metadata=metadata)
+    return LazyVolume(str(path), grid, partial(_itk_box, path, data_file), space=assumed, metadata=metadata)
 
 
 def _missing_orientation(path: Path, reader: sitk.ImageFileReader) -> str:
@@ -60,12 +65,16 @@ def _missing_orientation(path: Path, reader: sitk.ImageFileReader) -> str:
     return ""
 
 
-def _itk_box(path: Path, box: Box) -> np.ndarray:
+def _itk_box(path: Path, data_file: Path, box: Box) -> np.ndarray:
     reader = sitk.ImageFileReader()
-    reader.SetFileName(str(path))
     reader.SetExtractIndex([a.start for a in box])
     reader.SetExtractSize([a.stop - a.start for a in box])
-    with parsing(f"{path}: cannot be read to its end", "expected a whole file; copy or export it again"):
+    failed = f"{path}: cannot be read to its end"
+    with (
+        plain_path(path, data_file) as name,
+        parsing(failed, "expected a whole file; copy or export it again"),
+    ):
+        reader.SetFileName(name)
         return sitk.GetArrayFromImage(reader.Execute())
 
 

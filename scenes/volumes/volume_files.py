@@ -5,7 +5,7 @@ from pathlib import Path
 
 import SimpleITK as sitk
 
-from scenes.atomic_files import atomic_write
+from scenes.atomic_files import atomic_write, plain_path
 from scenes.patient_space import Space
 from scenes.volumes.itk_files import META, NRRD, itk_volume
 from scenes.volumes.lazy_volume import LazyVolume
@@ -40,9 +40,9 @@ def file_volume(path: Path, vectors: bool = False, space: Space | None = None) -
 
 def save_image(image: sitk.Image, path: Path) -> None:
     """Write an image, compressed, as NRRD or MetaImage by the suffix. Raises OSError."""
-    with atomic_write(path) as partial:
+    with atomic_write(path) as partial, plain_path(partial) as name:
         try:
-            sitk.WriteImage(image, str(partial), useCompression=True)
-            sitk.ReadImage(str(partial))  # ITK does not report a disk that is full at the last bytes
+            sitk.WriteImage(image, name, useCompression=True)
+            sitk.ReadImage(name)  # ITK does not report a disk that is full at the last bytes
         except RuntimeError:  # ITK's message has many lines and no cause
             raise OSError(errno.EIO, "cannot be written completely (is the disk full?)") from None

@@ -23,6 +23,7 @@ from rehearsal.commands.command_line import (
 )
 from rehearsal.configuration import choose_setup
 from rehearsal.worker_processes import Workers
+from scenes.folder_files import without_system_files
 from scenes.scene import model_with
 from scenes.tissue import QUALITIES, TISSUES, USUAL
 from studies.accuracy.bead_case import load_case
@@ -130,6 +131,7 @@ def calibrate(asked: CalibrateOptions) -> None:
     Shape matching as the paper did: every stiffness is tried for each particle radius, and judged on held-out data.
     neo-hookean: moduli, Poisson's ratio and friction by least squares, from beads and, where the case has them, forces on the probe.
     """
+    asked = asked.model_copy(update={"case": without_system_files(asked.case) or asked.case})
     if asked.model == USUAL:
         _fit_material(asked)
     else:

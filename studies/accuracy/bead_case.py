@@ -21,6 +21,7 @@ from sim.attachment import FixedRegion
 from sim.material import Material, Part
 from sim.signed_distance import signed_distance
 from studies.number_table import read_numbers
+from text_files import read_text
 
 # The paper's, where a case has none.
 DENSITY_KG_M3 = 1050.0
@@ -258,7 +259,7 @@ def _part(folder: Path, part: CasePart) -> Part:
 def _read_file(folder: Path) -> CaseFile:
     path = folder / "case.toml"
     try:
-        return CaseFile.model_validate(tomllib.loads(path.read_text("utf-8")))
+        return CaseFile.model_validate(tomllib.loads(read_text(path)))
     except (FileNotFoundError, NotADirectoryError):
         raise CaseError(
             f"{folder}: holds no case.toml; name a folder with case.toml, two STL surfaces and beads.csv"

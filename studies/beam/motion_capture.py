@@ -10,6 +10,7 @@ from scipy.optimize import OptimizeWarning, curve_fit
 from scipy.signal import find_peaks
 
 from errors import UserError
+from scenes.folder_files import entries_of
 from studies.number_table import read_numbers
 
 COLUMNS = (
@@ -66,7 +67,7 @@ class Oscillation:
 
 def load_captures(folder: Path) -> list[Capture]:
     """All recordings of a folder, lightest load first. Raises BeamError."""
-    paths = sorted(Path(folder).glob("*.csv"))
+    paths = [path for path in entries_of(Path(folder)) if path.suffix == ".csv"]
     if not paths:
         raise BeamError(f"{folder}: holds no recordings (*.csv)")
     return sorted((read_capture(path) for path in paths), key=lambda capture: (capture.load_g, capture.name))

@@ -19,6 +19,7 @@ from rehearsal.planning.plan_file import write_plan
 from rehearsal.planning.sweep_trial import PlanningProblem
 from rehearsal.result_files import rounded, write_csv, write_json
 from rehearsal.worker_processes import Workers, error_of, has_ended
+from scenes.folder_files import without_system_files
 from scenes.surfaces import volume_mm3
 from scenes.tissue import QUALITIES
 from studies.cohort.cohort_table import CohortFile, PatientRow, read_rows, text_of, write_rows
@@ -63,6 +64,7 @@ def cohort(
 
     FOLDER... are patients' folders or scene files. Started again with the same --out, it goes on where it was interrupted.
     """
+    folders = without_system_files(folders)
     make_folder(out)
     earlier = read_rows(out)
     with tqdm(total=len(folders), desc="cohort", unit="patient") as bar:

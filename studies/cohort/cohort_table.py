@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from errors import UserError, explained
 from rehearsal.result_files import write_json
 from studies.study_results import table_of
+from text_files import read_text
 
 FILE = "cohort.json"
 
@@ -86,7 +87,7 @@ def read_rows(folder: Path) -> list[PatientRow]:
     """The rows that an earlier study left in a folder; none where it has no table. Raises CohortError."""
     path = folder / FILE
     try:
-        return CohortFile.model_validate_json(path.read_text("utf-8")).patients
+        return CohortFile.model_validate_json(read_text(path)).patients
     except FileNotFoundError:
         return []
     except (OSError, UnicodeDecodeError) as error:

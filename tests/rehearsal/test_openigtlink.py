@@ -332,6 +332,42 @@ def test_a_pose_goes_stale(said):
     assert np.allclose(received.pose(), np.diag([-1, -1, 1, 1])) and said == []
 
 
+@pytest.mark.parametrize("rest", [b"\0\xff\xfe\x80", b"\0\xcd\xcd"])
+def test_what_follows_the_end_of_a_name_is_not_part_of_it(server, rest):
+    message = bytearray(hand_message(pose()))
+    for begin, text in ((2, b"TRANSFORM" + rest[:3]), (14, HAND_TO_REFERENCE.encode() + rest)):
+        message[begin : begin + len(text)] = text
+    with joined(server) as connection:
+        connection.sendall(message)
+        assert soon(lambda: server.received_pose.pose() is not None)
+
+
+@pytest.mark.parametrize("at", [-3, 57], ids=["body", "checksum"])
+def test_damaged_messages_are_ignored_counted_and_said_once(said, at):
+    with OpenIGTLinkServer("127.0.0.1", 0, said.append) as server, joined(server) as connection:
+        damaged = bytearray(hand_message(changed((0, 3), 99.0)))
+        damaged[at] ^= 1
+        connection.sendall(damaged * 3)
+        assert soon(lambda: server.damaged_messages == 3) and server.received_pose.pose() is None
+        connection.sendall(hand_message(np.eye(4)))
+        assert soon(lambda: server.received_pose.pose() is not None)
+        assert len(said) == 1 and "wrong checksum" in said[0]
+    assert said[1:] == ["3 damaged messages of the link were ignored"]
+
+
+@pytest.mark.parametrize("clients", [1, 3])
+def test_closing_with_clients_says_nothing(said, caplog, clients):
+    server = OpenIGTLinkServer("127.0.0.1", 0, said.append)
+    connections = [joined(server) for _ in range(clients)]
+    server.send(*live(0))
+    for connection in connections:
+        next_picture(connection)
+    server.close()
+    assert said == [] and caplog.records == []
+    for connection in connections:
+        connection.close()
+
+
 def changed(at: tuple, value: float) -> np.ndarray:
     matrix = pose()
     matrix[at] = value

@@ -23,7 +23,15 @@ from rehearsal.inputs.user_input import UserInput
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.script import ResectionScript, ScriptedAction
 from rehearsal.sessions import recorder
-from rehearsal.sessions.packed_arrays import pack_poses, pack_seen, unpack_poses, unpack_seen
+from rehearsal.sessions.packed_arrays import (
+    StateError,
+    pack_poses,
+    pack_seen,
+    pack_state,
+    unpack_poses,
+    unpack_seen,
+    unpack_state,
+)
 from rehearsal.sessions.recorder import SessionRecorder, record
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session import Session
@@ -359,6 +367,62 @@ def test_what_is_no_session_is_said_so_in_one_line(tmp_path):
     for path in (tmp_path / "none", tmp_path):
         with pytest.raises(SessionError):
             read_log(path)
+
+
+@pytest.mark.parametrize("length_s", [1e9, 1e-12, -1.0])
+def test_a_session_of_absurd_steps_is_refused(tmp_path, length_s):
+    (tmp_path / "file").write_text(
+        header().model_copy(update=dict(time_step_s=length_s)).model_dump_json() + "\n"
+    )
+    with pytest.raises(SessionError, match=r"^file: .*time_step_s = .* should be"):
+        read_log(tmp_path / "file")
+
+
+@pytest.mark.parametrize(
+    "pose", [0 * np.eye(4), 3 * np.eye(4), np.diag([1.0, 1, -1, 1]), np.eye(4) + np.eye(4, k=3) * 1e6]
+)
+def test_a_pose_of_a_session_that_is_none_is_named_by_its_line(tmp_path, pose):
+    written(tmp_path / "session", 41)
+    lines = (tmp_path / "session").read_bytes().split(b"\n")
+    second = json.loads(lines[2])
+    second["poses"] = pack_poses([*unpack_poses(second["poses"])[:-1], pose])
+    (tmp_path / "session").write_bytes(b"\n".join([*lines[:2], json.dumps(second).encode(), *lines[3:]]))
+    with pytest.raises(SessionError, match="^session: line 3 has a pose that is none of a probe"):
+        read_log(tmp_path / "session")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("grip.turn_deg", np.nan),
+        ("grip.depth_mm", np.inf),
+        ("numbers", np.inf),
+        ("numbers", np.nan),
+    ],
+)
+def test_a_state_with_what_is_no_number_is_refused(tmp_path, name, value):
+    numbers = Numbers()
+    text = pack_state(numbers.snapshot())
+    arrays = dict(np.load(io.BytesIO(base64.b64decode(text))))
+    arrays[name] = np.full(arrays[name].shape, value, arrays[name].dtype if name != "numbers" else float)
+    changed = io.BytesIO()
+    np.savez_compressed(changed, **arrays)
+    with pytest.raises(StateError, match="cannot be used"):
+        unpack_state(base64.b64encode(changed.getvalue()).decode(), numbers.settled)
+    assert unpack_state(text, numbers.settled) is not None
+
+
+@pytest.mark.parametrize(("name", "value"), [("position", np.nan), ("velocity", np.inf)])
+def test_a_session_that_begins_with_tissue_that_is_not_finite_is_refused(tmp_path, name, value):
+    written(tmp_path / "session", 41)
+    log, numbers = read_log(tmp_path / "session"), Numbers()
+    state = numbers.snapshot()
+    body = state.solver.body
+    damaged = replace(body, **{name: np.full_like(getattr(body, name), value)})
+    state = replace(state, solver=replace(state.solver, body=damaged))
+    log.header = log.header.model_copy(update=dict(begins=pack_state(state)))
+    with pytest.raises(SessionError, match="a state of tissue that is not finite"):
+        Replay(numbers, log)
 
 
 class FullDisk(io.RawIOBase):

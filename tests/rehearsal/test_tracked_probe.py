@@ -73,6 +73,15 @@ def steps(live: UserInput, count: int, **did: Any) -> np.ndarray:
     return at(live)
 
 
+@pytest.mark.parametrize("name", ["a.igs.mhd", "a.igs.nhdr"])
+def test_a_sweep_of_two_files_is_refused_with_what_is_read(tmp_path, name):
+    (tmp_path / name).write_text("ObjectType = Image\n")
+    with pytest.raises(
+        SweepError, match=r"expected a sweep in one file \(\.igs\.mha, \.igs\.nrrd\), a plan, or poses"
+    ):
+        load_track(tmp_path / name)
+
+
 def test_the_transducer_comes_to_be_where_the_probe_is_tracked():
     tracker = Tracker(placed(3.0, -2.0, 25.0))
     live = live_of(tracker)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shutil
 import subprocess
 import sys
 from contextlib import nullcontext
@@ -14,7 +15,7 @@ import trimesh
 from conftest import ROOT
 from null_viewer import NullViewer
 
-from render import background_image, transducer_shape, ultrasound_panel
+from render import background_image, display, transducer_shape, ultrasound_panel
 from render.camera import OrbitCamera
 from render.cut_face import FLESH
 from render.display import display_available, fitted, scale_of, window_size
@@ -590,6 +591,24 @@ def test_a_missing_display_is_detected(monkeypatch, display):
     if display:
         monkeypatch.setenv("DISPLAY", display)
     assert not display_available() and window_size() == FULL_SIZE
+
+
+@pytest.mark.skipif(shutil.which("Xvfb") is None, reason="needs Xvfb")
+@pytest.mark.parametrize("depth", [16, 24])
+def test_the_depth_of_a_screen_is_asked(monkeypatch, depth):
+    server = subprocess.Popen(
+        ["Xvfb", "-displayfd", "1", "-screen", "0", f"640x480x{depth}"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+    display._of_x11.cache_clear()
+    try:
+        monkeypatch.setenv("DISPLAY", f":{server.stdout.readline().decode().strip()}")
+        assert display.wrong_depth() == (None if depth == 24 else depth)
+    finally:
+        display._of_x11.cache_clear()
+        server.terminate()
+        server.wait()
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,17 @@
 """Files and folders that are there whole or not at all."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+import SimpleITK as sitk
 
-from scenes.atomic_files import atomic_write
+from errors import PatientError
+from scenes.atomic_files import atomic_write, new_folder
+from scenes.volumes.volume_files import file_volume, save_image
 
 
 def written(path: Path, fault: BaseException) -> None:
@@ -50,3 +57,51 @@ def test_a_folder_takes_the_place_of_an_empty_one_alone(tmp_path):
         made(path, "second")
     assert caught.value.filename == str(path)
     assert [each.name for each in tmp_path.iterdir()] == ["a"] and (path / "b").read_text() == "first"
+
+
+def test_the_folder_that_another_run_writes_is_not_removed(tmp_path):
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    alive, killed, old = (
+        f".{writer}.partial-a" for writer in (f"{os.getpid()}-0a", f"{ended.pid}-0b", "0a1b2c3d")
+    )
+    for name in (alive, killed, old):
+        (tmp_path / name).mkdir()
+    with new_folder(tmp_path / "a") as partial:
+        names = {each.name for each in tmp_path.iterdir()}
+        assert names == {alive, partial.name}
+
+
+@pytest.mark.parametrize("first", ["outer", "inner"])
+def test_of_two_runs_into_one_folder_the_later_is_refused_in_words(tmp_path, first):
+    path, expected = tmp_path / "a", "exists and is not an empty folder; choose another"
+    with pytest.raises(PatientError, match=expected), new_folder(path) as outer:  # noqa: PT012
+        (outer / "b").write_text("outer")
+        if first == "outer":
+            os.replace(outer, path)
+            with new_folder(path):
+                pytest.fail("began")
+        with new_folder(path) as inner:
+            (inner / "b").write_text("inner")
+    assert (path / "b").read_text() == first and len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere names of files are Unicode")
+@pytest.mark.parametrize("suffix", [".nrrd", ".nhdr", ".mha", ".mhd"])
+@pytest.mark.parametrize("names", [(b"pat\xe9", "ct"), (b"plain", b"ct\xe9")])
+def test_volumes_with_names_that_are_not_utf_8_are_written_and_read(tmp_path, names, suffix):
+    image = sitk.GetImageFromArray(np.arange(24, dtype=np.int16).reshape(2, 3, 4))
+    folder, name = map(os.fsdecode, names)
+    path = tmp_path / folder / f"{name}{suffix}"
+    path.parent.mkdir()
+    if suffix in (".nrrd", ".mha"):
+        save_image(image, path)
+    else:  # the voxels are in a second file
+        plain = tmp_path / f"written{suffix}"
+        sitk.WriteImage(image, str(plain))
+        for part in tmp_path.glob("written.*"):
+            part.rename(path if part == plain else path.parent / part.name)
+    assert (file_volume(path).read() == sitk.GetArrayFromImage(image)).all()
+    path.write_bytes(path.read_bytes()[:40])
+    with pytest.raises(PatientError, match="expected"):
+        file_volume(path)

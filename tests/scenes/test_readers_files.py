@@ -22,6 +22,30 @@ class TestFiles:
         path = written(tmp_path / f"ct{ending}", with_voxels(noise(), voxels))
         assert open_ct(path).hounsfield()[0, 0, :2].tolist() == [32767, AIR]
 
+    @pytest.mark.parametrize(
+        ("written_as", "renamed", "words"),
+        [
+            ("a.nii", "b.nii.gz", "NIfTI that is not compressed; .*rename it to end in .nii$"),
+            ("a.nii.gz", "b.nii", "is compressed; .*rename it to end in .nii.gz$"),
+            ("<!DOCTYPE html>", "b.nii.gz", "is a web page or XML"),
+            ("\n<html>", "b.nii", "is a web page or XML"),
+            (
+                "ten words that are no volume of anything",
+                "b.nii.gz",
+                "is not compressed by gzip; .*copy or export",
+            ),
+        ],
+    )
+    def test_nifti_that_is_not_what_its_name_says(self, tmp_path, written_as, renamed, words):
+        path = tmp_path / renamed
+        if written_as.startswith("a."):
+            written(tmp_path / written_as, noise()).rename(path)
+        else:
+            path.write_text(written_as)
+        with pytest.raises(PatientError, match=words) as caught:
+            open_ct(path)
+        assert "Error" not in str(caught.value)
+
     def test_what_no_memory_holds_is_refused_with_what_it_takes(self, tmp_path, monkeypatch):
         ct = open_ct(written(tmp_path / "ct.mha", noise()))
         needed = 5 * np.prod(ct.grid.size)

@@ -203,6 +203,9 @@ def test_calibrate_reports_mistakes_in_one_line(monkeypatch, folders, tmp_path, 
     assert "--out" in refused(a)
     assert "CASE" in refused(*out)
     assert "holds no case.toml" in refused(tmp_path, *out)
+    for name in ("Thumbs.db", "._case"):  # the shell's * gives these too
+        assert f"{tmp_path}: holds no case.toml" in refused(tmp_path / name, tmp_path, *out)
+        assert f"{name}: holds no case.toml" in refused(tmp_path / name, *out)
     assert "--radii is '2.7,x'" in refused(a, *out, "--radii", "2.7,x")
     assert "--radii is '0.1'" in refused(a, *out, "--radii", "0.1")
     assert "--hold-out" in refused(a, *out, "--hold-out", "nothing")

@@ -166,6 +166,15 @@ class Here:
             yield number, future
 
 
+@pytest.mark.parametrize("names", [["Thumbs.db"], ["desktop.ini", "._a"]])
+def test_files_of_an_operating_system_are_no_patients(tmp_path, capsys, names):
+    for name in names:
+        (tmp_path / name).touch()
+    files = [str(tmp_path / name) for name in names]
+    assert app.main(["study", "cohort", *files, "--jobs", "1", "--out", str(tmp_path / "out")]) == 0
+    assert "0 of 0 patients" in capsys.readouterr().out
+
+
 def test_an_interrupted_cohort_goes_on_where_it_was(patients, tmp_path, monkeypatch):
     """Interrupted in the second patient: the first is in the table already, and is not computed again."""
     out, tried = tmp_path / "out", []

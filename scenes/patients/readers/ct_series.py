@@ -1,5 +1,6 @@
 """Open a CT: a volume file, or one series of DICOM files; or list what a path has."""
 
+import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from errors import PatientError
+from scenes.folder_files import entries_of
 from scenes.patient_space import Space
 from scenes.patients.readers.dicom_files import SourceFile, find_dicom_files
 from scenes.patients.readers.dicom_headers import DicomContents, DicomSlice, Series, read_headers
@@ -24,6 +26,7 @@ from scenes.patients.readers.series_choice import (
     series_of_labels,
 )
 from scenes.patients.readers.slice_stack import stack_slices
+from scenes.patients.readers.split_series import is_single, joined
 from scenes.patients.readers.volume_folder import only_volume, volume_files
 from scenes.surfaces import OTHER_ENDINGS, is_surface_file
 from scenes.terminal import Progress, shell_command, silent
@@ -69,6 +72,7 @@ class CtListing:
 
     series: list[SeriesRow]  # by number
     labels: list[LabelsRow]  # by file
+    unreadable: int = 0  # subfolders that cannot be listed
 
 
 def list_ct(path: Path, progress: Progress = silent, space: Space | None = None) -> CtListing:
@@ -90,7 +94,9 @@ def list_ct(path: Path, progress: Progress = silent, space: Space | None = None)
         for s, patient in zip(candidates, patients, strict=True)
     ]
     return CtListing(
-        files + rows, [_row_of_labels(kind, item, candidates, patients) for kind, item in found.labels]
+        files + rows,
+        [_row_of_labels(kind, item, candidates, patients) for kind, item in found.labels],
+        len(found.unreadable),
     )
 
 
@@ -137,7 +143,12 @@ def open_ct(
         notes.append(f"left out, beside the DICOM files: {len(volumes)} NIfTI, NRRD or MHA files")
     # A damaged header may have lost the UID of its series.
     damaged = [fault for s in found.candidates if s is not chosen and not s.slices for fault in s.faults]
-    with _naming("damaged", damaged):
+    if found.unreadable:
+        notes.append(
+            f"{len(found.unreadable)} subfolders cannot be read, so the series may be incomplete; check their permissions"
+        )
+    with _naming("damaged", damaged), _naming("subfolders that cannot be read", found.unreadable):
+        _check_split(path, chosen, found.candidates)
         volume = _series_volume(path, chosen, progress)
     return replace(volume, notes=(*notes, *volume.notes))
 
@@ -146,7 +157,8 @@ def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
     """The contents of a folder, DICOMDIR or archive with DICOM files. Raises PatientError where there are neither these nor other
     volumes.
     """
-    items = find_dicom_files(path)
+    unreadable: list[str] = []
+    items = find_dicom_files(path, lambda error: unreadable.append(_below(path, error)))
     if not items and (is_surface_file(path) or path.suffix.lower() in OTHER_ENDINGS):
         raise PatientError(f"{path}: is a surface; expected a CT; give the CT first, then its labels")
     if not items and path.is_file():
@@ -155,14 +167,36 @@ def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
             f"{', '.join(ENDINGS)}; convert it"
         )
     if not items and not volume_files(path):
-        if any(is_surface_file(file) for file in path.iterdir()):
+        if any(is_surface_file(file) for file in entries_of(path)):
             raise PatientError(
                 f"{path}: has surfaces, and no CT; expected a CT before them: {shell_command('import', 'CT', path, '--out', 'FOLDER')}"
+            )
+        if unreadable:
+            raise PatientError(
+                f"{path}: cannot be read in {listed(unreadable)}; check the permissions of these folders"
             )
         raise PatientError(
             f"{path}: no DICOM file found; give the folder of the slices, or a NIfTI, NRRD or MHA file"
         )
-    return read_headers(items, lambda files: progress(files, "headers"))
+    found = read_headers(items, lambda files: progress(files, "headers"))
+    series = {one.uid: one for one in joined(list(found.series.values()))}
+    return replace(found, series=series, unreadable=unreadable)
+
+
+def _below(path: Path, error: OSError) -> str:
+    """The folder of an error, within a path."""
+    return os.path.relpath(error.filename, path)
+
+
+def _check_split(path: Path, series: Series, candidates: list[Series]) -> None:
+    """Raises PatientError where a series is one of several of one slice each, which do not join to one."""
+    count = sum(map(is_single, candidates))
+    if is_single(series) and count > 1:
+        raise PatientError(
+            f"{path}: {count} slices have a SeriesInstanceUID of their own each, and are no stack of one study, frame of reference, size "
+            "and spacing at even distances; expected a series of slices; export it again as one series, or give it as one volume file "
+            "(NIfTI, NRRD, MHA)"
+        )
 
 
 def ct_candidates(path: Path, found: DicomContents) -> list[Series]:
@@ -182,8 +216,15 @@ def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume
             f"{path}: {fault}{f' (and {more} more files of this series)' if more else ''}; "
             "export the series again"
         )
+    if len(series.pages) > len(series.slices):
+        raise PatientError(
+            f"{path}: {len(series.pages)} of {len(series.pages) + len(series.slices)} files of this series have no ImagePositionPatient "
+            f"and ImageOrientationPatient: {listed(series.pages)}; expected a CT's slices; export the series again"
+        )
     slices, strays = _one_view(series)
-    notes = []
+    notes = list(series.notes)
+    if series.pages:
+        notes.append(f"left out, without a place in the patient, such as screen saves: {len(series.pages)}")
     if series.localizers + len(strays):
         notes.append(f"left out, localisers: {series.localizers + len(strays)}")
     if not all(one.is_rescaled for one in slices):
@@ -191,7 +232,8 @@ def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume
     positions = {one.patient_position for one in slices} - {""}
     if len(positions) > 1:
         notes.append("the slices have different PatientPositions: none was taken")
-    with _naming("in another view or size", [one.label for one in strays]):
+    strange = [one.label for one in strays]
+    with _naming("in another view or size", strange), _naming("without a place in the patient", series.pages):
         stack = stack_slices(str(path), slices, lambda files: progress(files, "slices"))
     return replace(
         stack,

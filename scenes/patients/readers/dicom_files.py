@@ -2,7 +2,6 @@
 
 import io
 import logging
-import os
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from pydicom.filereader import read_dataset
 from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
 from errors import PatientError, parsing
+from scenes.folder_files import files_below, is_system_file
 
 # Values are validated where they are used; pydicom's warnings and logs would print them, also identifiers of the patient.
 config.settings.reading_validation_mode = config.IGNORE
@@ -79,14 +79,16 @@ def _check_inflated(file: BinaryIO, name: str) -> None:
                 )
 
 
-def find_dicom_files(path: Path) -> list[SourceFile]:
+def find_dicom_files(path: Path, unreadable: Callable[[OSError], object] | None = None) -> list[SourceFile]:
     """The files with a DICOM signature in a folder and its subfolders, a DICOMDIR, a zip archive or one file.
+
+    ``unreadable`` is called for each subfolder that cannot be listed.
 
     Raises PatientError: too many or too large files, an archive that is damaged, encrypted or has paths outside itself, a
     DICOMDIR whose files are missing or elsewhere.
     """
     if path.is_dir():
-        items = _of_folder(path)
+        items = _of_folder(path, unreadable)
     elif zipfile.is_zipfile(path) or _begins_as_archive(path):
         return _of_archive(path)
     elif path.name.upper() == "DICOMDIR":
@@ -121,14 +123,10 @@ def _looks_like_dicom(start: bytes) -> bool:
     return start[MAGIC_AT:] == MAGIC or (start[:2] in (b"\x08\x00", b"\x02\x00") and start[3:4] == b"\x00")
 
 
-def _of_folder(folder: Path) -> list[SourceFile]:
+def _of_folder(folder: Path, unreadable: Callable[[OSError], object] | None) -> list[SourceFile]:
     items: list[SourceFile] = []
-    for root, folders, files in os.walk(folder):
-        folders.sort()
-        for name in sorted(files):
-            file = Path(root, name)
-            if file.is_file():
-                items.append(_disk_file(file, str(file.relative_to(folder))))
+    for file in files_below(folder, unreadable):
+        items.append(_disk_file(file, str(file.relative_to(folder))))
         if len(items) > MOST_FILES:
             raise PatientError(
                 f"{folder}: more than {MOST_FILES} files; expected one patient's; give the folder of the CT itself"
@@ -174,7 +172,11 @@ def _listed(path: Path) -> list[list[str]]:
 def _of_archive(path: Path) -> list[SourceFile]:
     with parsing(f"{path}: a damaged archive", DAMAGED):
         archive = zipfile.ZipFile(path)
-        entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+        entries = [
+            entry
+            for entry in archive.infolist()
+            if not (entry.is_dir() or is_system_file(PurePosixPath(entry.filename)))
+        ]
     if len(entries) > MOST_FILES:
         raise PatientError(f"{path}: has {len(entries)} files; expected at most {MOST_FILES}")
     for entry in entries:

@@ -39,6 +39,8 @@ IDENTIFYING = (
     "SOPClassUID", "Modality", "SeriesInstanceUID", "SeriesNumber", "FrameOfReferenceUID", "PatientID", "StudyInstanceUID",
 )  # fmt: skip
 MODALITY = re.compile("[A-Z]{2,8}")
+# Values of ImageType of screen saves and dose reports, which may be in the series of their CT.
+PAGES = {"SCREEN SAVE", "DOSE_INFO"}
 LOCALIZERS = {"LOCALIZER", "SCOUT", "TOPOGRAM"}
 # Values of ImageType whose pixels are not HU.
 NOT_HU = {
@@ -97,7 +99,7 @@ class DicomSlice:
 
 @dataclass(eq=False)
 class Series:
-    """The slices of one SeriesInstanceUID, in file order. The UIDs and the ID are the patient's (PHI), and are never shown."""
+    """The slices of one SeriesInstanceUID, or of several that were joined, in file order. The UIDs and the ID are the patient's (PHI), and are never shown."""
 
     uid: str
     number: str
@@ -107,11 +109,21 @@ class Series:
     slices: list[DicomSlice] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)  # a line for each slice that cannot be used
     localizers: int = 0
+    pages: list[str] = field(
+        default_factory=list
+    )  # files without a place in the patient, such as screen saves
+    other_uids: frozenset[str] = frozenset()  # of series that were joined to it
+    notes: list[str] = field(default_factory=list)  # for the user
+
+    @property
+    def uids(self) -> frozenset[str]:
+        """All its SeriesInstanceUIDs."""
+        return self.other_uids | {self.uid}
 
     @property
     def references(self) -> DicomReferences:
         """The objects that it consists of."""
-        frames, series = ({uid} - {""} for uid in (self.frame_of_reference, self.uid))
+        frames, series = ({self.frame_of_reference} - {""}, self.uids - {""})
         slices = {one.sop for one in self.slices} - {""}
         return DicomReferences(frozenset(frames), frozenset(series), frozenset(slices), self.patient)
 
@@ -123,11 +135,12 @@ class DicomContents:
     series: dict[str, Series] = field(default_factory=dict)
     labels: list[tuple[str, SourceFile]] = field(default_factory=list)  # SEG or RTSTRUCT, and the file
     others: Counter[str] = field(default_factory=Counter)  # of each modality, other files
+    unreadable: list[str] = field(default_factory=list)  # subfolders that cannot be listed
 
     @property
     def candidates(self) -> list[Series]:
         """All series with CT slices, also damaged ones."""
-        return [series for series in self.series.values() if series.slices or series.faults]
+        return [series for series in self.series.values() if series.slices or series.faults or series.pages]
 
 
 def read_headers(
@@ -155,7 +168,10 @@ def read_headers(
                 series.slices += [one for one in slices if one is not None]
                 series.localizers += slices.count(None)
             except PatientError as error:
-                series.faults.append(str(error))
+                if patient == series.patient and _is_page(header):
+                    series.pages.append(item.name)
+                else:
+                    series.faults.append(str(error))
         elif sop_class:
             # Free text may name the patient.
             found.others[modality if MODALITY.fullmatch(modality) else "files of unknown kind"] += 1
@@ -164,6 +180,18 @@ def read_headers(
         elif not is_directory:
             found.others["files of unknown kind"] += 1
     return found
+
+
+def _is_page(header: Dataset) -> bool:
+    """Whether an image has no place in the patient: a screen save, a dose report, or a slice that lost it."""
+    places = "ImagePositionPatient", "ImageOrientationPatient", "NumberOfFrames"
+    try:
+        if PAGES.intersection(map(str, header.get("ImageType") or [])):
+            return True
+        # A header that ends early has lost its Rows too.
+        return "Rows" in header and not any(header.get(name) for name in places)
+    except Exception:  # a damaged value, of any kind
+        return False
 
 
 def slices_of(item: SourceFile, header: Dataset) -> list[DicomSlice | None]:
@@ -205,6 +233,8 @@ def _slice(
     kind = {str(word).upper() for word in [*(value("ImageType") or []), *(value("FrameType") or [])]}
     if kind & LOCALIZERS:
         return None
+    if kind & PAGES:
+        raise PatientError(f"{item.name}: is a screen save or a report; expected a slice")
     if kind & NOT_HU:
         raise PatientError(
             f"{item.name}: its pixels are {', '.join(sorted(kind & NOT_HU))}; expected HU; give the CT that it was made from"

@@ -9,6 +9,7 @@ from pydicom.dataset import Dataset
 from pydicom.pixels import pixel_array
 
 from errors import PatientError, parsing
+from scenes.atomic_files import plain_path
 from scenes.patients.readers.dicom_files import SourceFile
 from scenes.patients.readers.dicom_headers import DicomSlice
 from scenes.volumes.lazy_volume import AIR_HU, LEAST_HU, MOST_HU
@@ -64,7 +65,8 @@ def _check_length(item: SourceFile, data: Dataset) -> None:
 def _decoded_by_gdcm(item: SourceFile, fault: str) -> np.ndarray:
     if item.path is None:
         raise PatientError(f"{fault}; its compression is rare: extract the archive and give the folder")
-    return sitk.GetArrayFromImage(sitk.ReadImage(str(item.path)))
+    with plain_path(item.path) as name:
+        return sitk.GetArrayFromImage(sitk.ReadImage(name))
 
 
 def _padded(raw: np.ndarray, padding: tuple[int, int]) -> np.ndarray:

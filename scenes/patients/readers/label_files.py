@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from errors import PatientError
+from scenes.folder_files import entries_of
 from scenes.patient_space import Space
 from scenes.patients.readers.ct_series import read_dicom_headers
 from scenes.patients.readers.dicom_files import find_dicom_files
@@ -97,7 +98,7 @@ def _files_of_folder(
     folder: Path, wanted: Collection[str], progress: Progress, space: Space | None
 ) -> Segmentation | None:
     """The label maps of a folder, or its surfaces, one per organ; None without either. Raises PatientError."""
-    entries = sorted(folder.iterdir()) if folder.is_dir() else []
+    entries = entries_of(folder) if folder.is_dir() else []
     surfaces = [file for file in entries if is_surface_file(file)]
     if organ_files := [file for file in entries if is_volume_file(file)]:
         of_maps = (

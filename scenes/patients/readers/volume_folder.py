@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from errors import PatientError
+from scenes.folder_files import files_below
 from scenes.patient_space import Space
 from scenes.patients.readers.label_maps import listed
 from scenes.patients.readers.segment_names import is_understood
@@ -21,8 +22,7 @@ CT_NAME = re.compile(r"(?i)(?<![a-z])(ct|image|arterial|(portal)?venous)(?![a-z]
 
 def volume_files(path: Path) -> list[Path]:
     """The volume files of a folder and its subfolders; none of a file."""
-    entries = path.rglob("*") if path.is_dir() else ()
-    return sorted(file for file in entries if is_volume_file(file) and file.is_file())
+    return sorted(filter(is_volume_file, files_below(path))) if path.is_dir() else []
 
 
 def only_volume(folder: Path, files: list[Path], space: Space | None = None) -> LazyVolume:
