@@ -5,6 +5,7 @@ import gc
 import signal
 import sys
 import threading
+from typing import Any
 
 try:
     import click
@@ -87,6 +88,13 @@ def cli() -> None:
     """
 
 
+def read_probe(name: str) -> Any:
+    """The probe of a name or file, for ``import``, whose folder knows nothing of ultrasound. Raises UserError."""
+    from ultrasound.probe import load_probe
+
+    return load_probe(name)
+
+
 def _stop_in_order() -> None:
     """On SIGTERM, clean up as after Ctrl-C, so that no incomplete patient's folder remains."""
     if threading.current_thread() is threading.main_thread():
@@ -107,7 +115,7 @@ def main(arguments: list[str]) -> int:
         arguments = ["rehearse", *arguments]
     _stop_in_order()
     try:
-        return cli.main(args=arguments, prog_name="app.py", standalone_mode=False) or 0
+        return cli.main(args=arguments, prog_name="app.py", standalone_mode=False, obj=read_probe) or 0
     except click.ClickException as error:
         message = error.format_message()
     except UserError as error:

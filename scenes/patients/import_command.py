@@ -1,6 +1,8 @@
 """The command ``import``: makes a patient's folder with a scene from a CT and its labels."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -24,6 +26,8 @@ TISSUE_OPTIONS = {
     "collecting": "urine",
 }
 LABEL = "Names or values of the labels"
+# The file of a probe of the user's own, in the patient's folder.
+PROBE_FILE = "probe.toml"
 
 
 @click.command("import")
@@ -57,7 +61,21 @@ LABEL = "Names or values of the labels"
     type=click.Choice(POSITIONS),
     help="How the patient lay in the CT [the CT's header, else supine]; left-decubitus is on the left side.",
 )
+@click.option(
+    "--probe",
+    metavar="NAME|FILE",
+    default="drop-in",
+    show_default=True,
+    help="The probe, by name (drop-in, linear, curvilinear, phased) or in a file, which is copied.",
+)
+@click.option(
+    "--uniform",
+    is_flag=True,
+    help="One stiffness for all tissue [tumour, cysts, sinus and collecting system have their own].",
+)
+@click.pass_obj
 def import_patient_command(
+    read_probe: Callable[[str], Any],
     ct: Path,
     labels: tuple[Path, ...],
     out: Path | None,
@@ -68,6 +86,8 @@ def import_patient_command(
     seed: str | None,
     support: str,
     position: Position | None,
+    probe: str,
+    uniform: bool,
     **words: str | None,
 ) -> None:
     """Make a patient's folder from a CT and its LABELS.
@@ -85,12 +105,15 @@ def import_patient_command(
     if out is None:
         raise click.UsageError("--out: expected a folder to write to, or --list to see what there is")
     check_folder(out)
+    housing_mm, probe_texts = read_probe(probe).housing_mm, {}
+    if Path(probe).suffix:
+        probe, probe_texts = PROBE_FILE, {PROBE_FILE: Path(probe).read_text("utf-8")}
     # Matplotlib and highdicom take 0.5 s to import.
     from scenes.patients.check_picture import as_table, draw_check, summary_rows
     from scenes.patients.import_request import import_request
     from scenes.patients.patient_complexity import complexity_of_patient
     from scenes.patients.patient_findings import findings_of
-    from scenes.patients.patient_scene import patient_scene
+    from scenes.patients.patient_scene import patient_scene, stiffness_row
 
     tissues = {TISSUE_OPTIONS[o]: label_words(text, o) for o, text in words.items() if text is not None}
     own = [] if organ is None else label_words(organ, "organ")
@@ -100,9 +123,10 @@ def import_patient_command(
     )
     patient = without_identifiers(patient, identifiers)
     complexity = complexity_of_patient(patient)
-    rows = summary_rows(patient, complexity)
-    texts = {
-        "scene.toml": scene_text(patient_scene(patient)),
+    scene = patient_scene(patient, uniform, probe, housing_mm)
+    rows = [*summary_rows(patient, complexity), stiffness_row(scene)]
+    texts = probe_texts | {
+        "scene.toml": scene_text(scene),
         FINDINGS_FILE: findings_text(findings_of(patient, complexity)),
     }
     searched = save_patient(
@@ -113,7 +137,7 @@ def import_patient_command(
     )
     click.echo(as_table(rows))
     click.echo(
-        "The probe is linear, which shows most of a kidney; --probe drop-in is the robotic one.\n"
+        f"The probe is {probe}, on the organ over the {'middle' if patient.tumour is None else 'tumour'}; --probe gives another.\n"
         f"Written to {out}. Check {out / 'check.png'}, then: {shell_command('rehearse', out)}"
     )
 
