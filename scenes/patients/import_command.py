@@ -7,7 +7,7 @@ from typing import Any
 import click
 import numpy as np
 
-from errors import PatientError
+from errors import PatientError, UserError
 from scenes.atomic_files import check_folder
 from scenes.import_findings import FINDINGS_FILE, findings_text
 from scenes.patients.patient_folder import save_patient, without_identifiers
@@ -105,9 +105,13 @@ def import_patient_command(
     if out is None:
         raise click.UsageError("--out: expected a folder to write to, or --list to see what there is")
     check_folder(out)
-    housing_mm, probe_texts = read_probe(probe).housing_mm, {}
+    try:
+        housing_mm, texts = read_probe(probe).housing_mm, dict[str, str]()
+    except UserError as error:
+        raise UserError(str(error).replace("transducer.probe", "--probe")) from None
+    # The program's own probes have names without a suffix.
     if Path(probe).suffix:
-        probe, probe_texts = PROBE_FILE, {PROBE_FILE: Path(probe).read_text("utf-8")}
+        probe, texts = PROBE_FILE, {PROBE_FILE: Path(probe).read_text("utf-8")}
     # Matplotlib and highdicom take 0.5 s to import.
     from scenes.patients.check_picture import as_table, draw_check, summary_rows
     from scenes.patients.import_request import import_request
@@ -125,7 +129,7 @@ def import_patient_command(
     complexity = complexity_of_patient(patient)
     scene = patient_scene(patient, uniform, probe, housing_mm)
     rows = [*summary_rows(patient, complexity), stiffness_row(scene)]
-    texts = probe_texts | {
+    texts |= {
         "scene.toml": scene_text(scene),
         FINDINGS_FILE: findings_text(findings_of(patient, complexity)),
     }

@@ -39,7 +39,7 @@ COMMON = (
     "encoding origin version side draft supine prone decubitus position extent surfaces faces volume label labels support series source "
     "length size spacing direction tissues warnings notes text acknowledged true false null none complexity tumours diameter exophytic share "
     "contact distance touches main vessel renal padua estimated not known needed least most suffix low moderate high to components points "
-    "measure unit location rim sinus artery and vein cm mesh kind "
+    "measure unit location rim sinus artery and vein cm mesh kind target fluid drop linear curvilinear phased "
 )
 
 
