@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from types import FrameType
+from typing import Any
 
 # After a signal within an import: this long until it is tried again [s].
 IMPORT_S = 0.02
@@ -122,6 +123,13 @@ def _show_any_letter() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
+def read_probe(name: str) -> Any:
+    """The probe of a name or file, for ``import``, whose folder knows nothing of ultrasound. Raises UserError."""
+    from ultrasound.probe import load_probe
+
+    return load_probe(name)
+
+
 def _file_error(error: OSError) -> str:
     """The message for an error of disk or file that no command has handled."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -136,7 +144,7 @@ def main(arguments: list[str]) -> int:
         arguments = ["rehearse", *arguments]
     try:
         _show_any_letter()
-        return cli.main(args=arguments, prog_name="app.py", standalone_mode=False) or 0
+        return cli.main(args=arguments, prog_name="app.py", standalone_mode=False, obj=read_probe) or 0
     except click.ClickException as error:
         message = error.format_message()
     except UserError as error:

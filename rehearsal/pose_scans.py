@@ -43,8 +43,12 @@ class PoseScans:
     ) -> None:
         self.probe, self.settings, self.out = probe, settings, out
         scanned = scanned_anatomy(anatomy.organ, ct, anatomy, np.zeros(3))
-        around = "background", contact, settings.contact_gap_mm
-        self.scanner = Scanner(scanned, Unmoved(), probe, settings.pixels, *around)
+        # Through the organ alone sound enters as in a rehearsal, perhaps through fluid.
+        wet = contact == "organ" and settings.outside == "fluid"
+        outside, gap_mm = (
+            ("fluid", settings.coupling_gap_mm) if wet else ("background", settings.contact_gap_mm)
+        )
+        self.scanner = Scanner(scanned, Unmoved(), probe, settings.pixels, outside, contact, gap_mm)
         self.rows: list[dict] = []
         self.ms: list[float] = []
         self.empty = 0

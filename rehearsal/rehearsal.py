@@ -34,7 +34,7 @@ from ultrasound.probe_manipulator import (
     image_plane,
     touching,
 )
-from ultrasound.scanner import ScannedAnatomy, Scanner, plane_section, start_acoustics
+from ultrasound.scanner import ScannedAnatomy, Scanner, plane_section, shows_ct, start_acoustics
 
 # Where the tumour protrudes, organ and tumour share a surface: the tumour's is drawn this far outside.
 TUMOUR_LIFT_MM = 0.8
@@ -139,11 +139,11 @@ class Rehearsal(PressedOrgan):
 
     def _build_scanner(self, scanned: ScannedAnatomy | None, acoustics: Future[np.ndarray] | None) -> None:
         image = self.scene.image
-        margin = SURROUNDINGS_MM if image.outside == "background" else 0.0
+        margin = SURROUNDINGS_MM if shows_ct(image.outside) else 0.0
         self.embedding = Embedding(self.model, self.organ, embedding_cell_mm(self.scene.tissue), margin)
         self.scanner = None
         if scanned is not None:
-            around = image.outside, image.contact, image.contact_gap_mm
+            around = image.outside, image.contact, image.coupling_gap_mm
             self.scanner = Scanner(scanned, self.embedding, self.probe, image.pixels, *around, acoustics)
 
     def _manipulator(self) -> ProbeManipulator:

@@ -184,7 +184,9 @@ class Image(Section):
     """The ultrasound panel: the kind of image, its detail level (``rung`` in scenes of version 1.0), and the CT window.
 
     The default depth is the probe's. An element is in contact where the organ is closer to the array than ``contact_gap_mm``; with
-    ``contact`` "tissue", where the CT shows anything but gas.
+    ``contact`` "tissue", where the CT shows anything but gas. ``outside`` "fluid": a layer of irrigation fluid of ``fluid_gap_mm``
+    covers the organ, through which elements are in contact too; in front of it is gas. Water stays on a surface up to a height of 1.4
+    times its capillary length, which is 2.7 mm.
     """
 
     mode: Literal["ct", "b-mode", "both"] = "both"
@@ -195,9 +197,23 @@ class Image(Section):
     pixels: int = Field(512, ge=16, le=4096)
     window_hu: float = Field(350.0, gt=0, le=10000)
     level_hu: float = Field(40.0, ge=-2000, le=4000)
-    outside: Literal["background", "gel", "air"] = "background"
+    outside: Literal["background", "gel", "air", "fluid"] = "background"
     contact: Literal["organ", "tissue"] = "organ"
     contact_gap_mm: float = Field(1.5, ge=0, le=20)
+    fluid_gap_mm: float = Field(4.0, ge=0, le=5)
+
+    @model_validator(mode="after")
+    def _fluid_is_on_the_organ(self) -> "Image":
+        if self.outside == "fluid" and self.contact != "organ":
+            raise ValueError(
+                f'image.outside = "fluid" couples the array to the organ, image.contact is "{self.contact}": set it to "organ", or leave it out'
+            )
+        return self
+
+    @property
+    def coupling_gap_mm(self) -> float:
+        """The distance from the organ up to which an element is in contact, through gel or fluid [mm]."""
+        return max(self.contact_gap_mm, self.fluid_gap_mm) if self.outside == "fluid" else self.contact_gap_mm
 
 
 class Press(Section):

@@ -131,6 +131,14 @@ def translated(mesh: trimesh.Trimesh, by_mm: np.ndarray) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices + by_mm, mesh.faces, process=False)
 
 
+def depth_below_hull(surface: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+    """How far points (n, 3) are inside the convex hull of a surface, shape (n,) [mm]; negative outside."""
+    hull = surface.convex_hull
+    normals = hull.face_normals
+    offsets = (normals * hull.triangles[:, 0]).sum(axis=1)
+    return np.min(offsets - points @ normals.T, axis=1)
+
+
 def volume_mm3(vertices: np.ndarray, faces: np.ndarray) -> float:
     """Volume [mm^3] inside a closed surface of vertices (n, 3) [mm] and faces (m, 3)."""
     corner = vertices[faces].astype(float)

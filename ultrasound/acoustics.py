@@ -63,6 +63,18 @@ def tissue_table() -> dict[str, dict]:
     return tomllib.loads(TISSUES.read_text("utf-8"))
 
 
+def acoustic_values(tissue: str) -> tuple[float, float, float, float]:
+    """Return the mean of a tissue's values, as those of a voxel in ``properties``."""
+    table = tissue_table()[tissue]
+    level = 10 ** ((table["backscatter_db"] + CORTEX_DB) / 20)
+    return (
+        table["impedance_mrayl"],
+        table["attenuation_db_cm_mhz"],
+        level,
+        table.get("anisotropy_db", 0.0),
+    )
+
+
 def check_tissues(tissue_of_label: Mapping[int, str]) -> None:
     """Raise TissueError for a label of a tissue that is not in the table."""
     known = [name for name in tissue_table() if name != "hounsfield"]

@@ -160,6 +160,9 @@ class Doppler:
             # What aliases is filtered as what it seems to be.
             seen = towards - 2.0 * limit * ti.round(towards / (2.0 * limit))
             energy = (amplitude * BLOOD * flow[4]) ** 2 * passed_by_wall_filter(seen / wall)
+            if ti.static(self.sound.has_fluid):
+                if self.sound.is_fluid(line, k):
+                    energy = 0.0
             phase = tm.pi * towards / limit
             moment = energy * tm.vec2(ti.cos(phase), ti.sin(phase))
             self.moment[line, k] = tm.vec3(moment.x + tissue, moment.y, energy + tissue)

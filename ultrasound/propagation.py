@@ -13,7 +13,7 @@ import taichi.math as tm
 
 from sim.device import TASK
 from sim.fields import array_of, fill
-from ultrasound.acoustics import MAST_OFFSET, MAST_SLOPE
+from ultrasound.acoustics import MAST_OFFSET, MAST_SLOPE, acoustic_values
 from ultrasound.aperture_rays import ApertureRays
 from ultrasound.beam import half_apertures_mm
 from ultrasound.interface import (
@@ -35,6 +35,8 @@ STRIDES = (8, 4)
 # quadrature with three nodes, exact for what changes as a polynomial of fifth degree.
 CENTRAL_PLANE = ((0.0, 1.0),)
 THICK_PLANE = ((0.0, 2 / 3), (-(1.5**0.5), 1 / 6), (1.5**0.5, 1 / 6))
+# What has less impedance is gas: in an empty crater no fluid stays.
+LEAST_FLUID_MRAYL = 0.3
 
 
 @ti.dataclass
@@ -53,7 +55,8 @@ class Propagation:
     ``tissue_volume`` (.., 4) has impedance, attenuation, backscatter and its anisotropy (``acoustics.properties``), ``organ`` the signed distance
     from the organ's surface [mm], both at rest; ``plane`` is a ``PlaneInTissue``. An element transmits and receives
     only in contact: with the organ, nearer than ``contact_gap_mm``, or, where ``contact`` is "tissue", with anything but gas.
-    ``around`` is the impedance [MRayl] of all that is outside the organ; None for what the CT shows there.
+    ``around`` is the impedance [MRayl] of all that is outside the organ; None for what the CT shows there. With ``has_fluid``, what a
+    scanline passes before it enters the organ is irrigation fluid where it is nearer than ``contact_gap_mm``, but no gas.
 
     ``tissue`` and ``rest`` (scanlines, samples) are what is there; ``across`` is the rest direction across the image plane. ``depth`` is
     where a sample is [mm]; the scanner shows it where it would be if sound were as fast everywhere (SOUND_MM_US).
@@ -71,12 +74,14 @@ class Propagation:
         contact: str = "organ",
         contact_gap_mm: float = 1.5,
         around: float | None = None,
+        has_fluid: bool = False,
     ) -> None:
         self.tissue_volume, self.organ, self.plane, self.voxel_mm = tissue_volume, organ, plane, voxel_mm
         # A CT blurs an interface by about a voxel to each side.
         self.interface_mm = 5.0 * voxel_mm
         self.by_organ, self.gap_mm = contact == "organ", contact_gap_mm
         self.organ_alone, self.around = around is not None, around or 0.0
+        self.has_fluid, self.fluid = has_fluid, acoustic_values("fluid")
         self.surface = Surface()
         self.lines, samples = probe.number_of_scanlines, probe.number_of_samples_per_scanline
         self.most = samples // STRIDES[1] + 1
@@ -171,10 +176,16 @@ class Propagation:
     @ti.func
     def sample_scanline(self, thick: ti.template(), line, count, step_mm):
         """Sample a scanline at even steps of time, which are as long as sound is fast in the tissue."""
-        depth = 0.0
+        depth, in_front = 0.0, True
         for k in range(count):
             planes = ti.static(THICK_PLANE if thick else CENTRAL_PLANE)
             found = self.tissue_at(planes, self.start[line] + depth * self.direction[line], self.slice_sd[k])
+            if ti.static(self.has_fluid):
+                if in_front:
+                    distance = self.organ.sample(found.rest)
+                    in_front = distance > 0.0
+                    if in_front and distance <= self.gap_mm and found.tissue.x > LEAST_FLUID_MRAYL:
+                        found.tissue = tm.vec4(self.fluid)
             self.tissue[line, k] = found.tissue.xyz
             if found.tissue.w > 0.0:
                 self.tissue[line, k].z *= self.anisotropy(found, self.direction[line])
@@ -182,6 +193,11 @@ class Propagation:
             self.across[line, k] = found.linear[:, 2]
             self.depth[line, k] = depth
             depth += step_mm * speed_ratio(found.tissue.x)
+
+    @ti.func
+    def is_fluid(self, line, k):
+        """Whether a tissue sample is irrigation fluid."""
+        return ti.abs(self.tissue[line, k].y - self.fluid[1]) < 1e-6
 
     @ti.func
     def anisotropy(self, found, direction):

@@ -33,6 +33,7 @@ OUTSIDE: dict[str, tuple[float, float | None]] = {
     "background": (0.0, None),
     "gel": (0.0, 1.5),
     "air": (AIR_HU, 4e-4),
+    "fluid": (0.0, None),
 }
 CT, B_MODE, DOPPLER = "CT", "B-mode", "Doppler"
 IMAGES_OF_MODE: dict[Mode, tuple[str, ...]] = {"ct": (CT,), "b-mode": (B_MODE,), "both": (B_MODE, CT)}
@@ -58,6 +59,11 @@ class ScannedAnatomy:
         return np.linalg.norm(np.linalg.inv(self.index_from_mm[:3, :3]), axis=0)
 
 
+def shows_ct(outside: str) -> bool:
+    """Whether the CT is shown around the organ."""
+    return OUTSIDE[outside][1] is None
+
+
 def start_acoustics(anatomy: ScannedAnatomy) -> Future[np.ndarray]:
     """Start computing the acoustic properties that B-mode images need, on a thread of its own."""
     worker = ThreadPoolExecutor(1)
@@ -71,7 +77,7 @@ class Scanner:
     """Images of at most ``pixels`` x ``pixels`` of an anatomy that an embedding deforms.
 
     ``outside`` is what is shown outside the organ: ``background``, the CT around it, which deforms with the organ as far as the
-    embedding reaches; ``gel`` (0 HU); ``air`` (-1000 HU). ``contact`` and ``contact_gap_mm`` see ``Propagation``. A mode is set up at its
+    embedding reaches; ``gel`` (0 HU); ``air`` (-1000 HU); ``fluid``, the CT, and sound passes through irrigation fluid in the gap. ``contact`` and ``contact_gap_mm`` see ``Propagation``. A mode is set up at its
     first image; ``acoustics`` are properties whose computation has already been started. Raises TissueError.
     """
 
@@ -92,7 +98,7 @@ class Scanner:
         self.probe = probe
         self.plane = PlaneInTissue(embedding, pixels)
         self.outside_hu, self.around = OUTSIDE[outside]
-        self.show_background = outside == "background"
+        self.show_background, self.has_fluid = shows_ct(outside), outside == "fluid"
         self.contact, self.contact_gap_mm = contact, contact_gap_mm
         self._acoustics = acoustics
         self.crater: Crater | None = None
@@ -165,7 +171,7 @@ class Scanner:
 
     def _propagation(self) -> Propagation:
         voxel_mm = float(self.anatomy.voxel_mm.mean())
-        around = self.contact, self.contact_gap_mm, self.around
+        around = self.contact, self.contact_gap_mm, self.around, self.has_fluid
         return Propagation(self.tissue, self.organ, self.plane, self.probe, voxel_mm, *around)
 
     def iq(

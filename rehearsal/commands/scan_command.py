@@ -103,7 +103,7 @@ def scan(asked: ScanOptions) -> None:
         probe=scan_probe.model_dump(by_alias=True),
         detail_level=settings.detail_level,
         contact=asked.contact,
-        contact_gap_mm=settings.contact_gap_mm,
+        contact_gap_mm=scans.scanner.contact_gap_mm,
         doppler=asked.doppler,
         clamped=asked.clamped,
         arch=used,

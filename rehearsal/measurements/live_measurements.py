@@ -114,7 +114,7 @@ class LiveMeasurements:
             self._covered = periods(session.time_s, COVERAGE_S)
             image = self.rehearsal.scene.image
             rest = self.rehearsal.scanner.plane.rest_grid(GRID_POINTS)
-            self._touches = self.coverage.add(rest, probe, image.contact_gap_mm)
+            self._touches = self.coverage.add(rest, probe, image.coupling_gap_mm)
         if self.guide is not None:
             self.guide.go_with(session)
         if is_due or periods(session.time_s, MEASURE_S) != self._measured:

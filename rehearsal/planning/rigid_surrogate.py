@@ -43,7 +43,7 @@ class RigidSurrogate:
         rehearsal = self.trial.rehearsal
         planes = image_plane(poses, rehearsal.size_mm[2], 1.0, 1.0).world_from_plane
         outside = self._outside_mm(planes)
-        touches = outside <= rehearsal.scene.image.contact_gap_mm
+        touches = outside <= rehearsal.scene.image.coupling_gap_mm
         depths = np.maximum(-outside.min(axis=1), 0.0)
         return self.trial.tried(
             parameters, poses, self._covered(planes, touches), depths, touches.mean(axis=1)

@@ -209,7 +209,7 @@ class Trial:
         rehearsal, organ, probe = self.rehearsal, self.rehearsal.organ, self.rehearsal.probe
         rehearsal.embedding.update()
         self.plane.locate(rehearsal.image_plane())
-        gap = rehearsal.scene.image.contact_gap_mm
+        gap = rehearsal.scene.image.coupling_gap_mm
         touches = self.coverage.add(self.plane.rest_grid(GRID_POINTS), probe, gap)
         rehearsal.organ_skin.update()
         now = array_of(rehearsal.organ_skin.vertices).astype(float)

@@ -1,11 +1,13 @@
 """The command ``import``: makes a patient's folder with a scene from a CT and its labels."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
 
-from errors import PatientError
+from errors import PatientError, UserError
 from scenes.atomic_files import check_folder
 from scenes.import_findings import FINDINGS_FILE, findings_text
 from scenes.patient_space import SPACES, Space
@@ -14,6 +16,7 @@ from scenes.patients.patient_position import POSITIONS, Position
 from scenes.patients.readers.segment_names import Side
 from scenes.scene import scene_text
 from scenes.terminal import bar, shell_command
+from text_files import read_text
 
 # Options that assign labels to a tissue.
 TISSUE_OPTIONS = {
@@ -25,6 +28,8 @@ TISSUE_OPTIONS = {
     "collecting": "urine",
 }
 LABEL = "Names or values of the labels"
+# The file of a probe of the user's own, in the patient's folder.
+PROBE_FILE = "probe.toml"
 
 
 @click.command("import")
@@ -64,7 +69,21 @@ LABEL = "Names or values of the labels"
     help="Where +x, +y and +z point in files that do not name it, such as RAS: to the patient's right, front (anterior) and head "
     "(superior).",
 )
+@click.option(
+    "--probe",
+    metavar="NAME|FILE",
+    default="drop-in",
+    show_default=True,
+    help="The probe, by name (drop-in, linear, curvilinear, phased) or in a file, which is copied.",
+)
+@click.option(
+    "--uniform",
+    is_flag=True,
+    help="One stiffness for all tissue [tumour, cysts, sinus and collecting system have their own].",
+)
+@click.pass_obj
 def import_patient_command(
+    read_probe: Callable[[str], Any],
     ct: Path,
     labels: tuple[Path, ...],
     out: Path | None,
@@ -76,6 +95,8 @@ def import_patient_command(
     support: str,
     position: Position | None,
     space: Space | None,
+    probe: str,
+    uniform: bool,
     **words: str | None,
 ) -> None:
     """Make a patient's folder from a CT and its LABELS.
@@ -93,12 +114,19 @@ def import_patient_command(
     if out is None:
         raise click.UsageError("--out: expected a folder to write to, or --list to see what there is")
     check_folder(out)
+    try:
+        housing_mm, texts = read_probe(probe).housing_mm, dict[str, str]()
+    except UserError as error:
+        raise UserError(str(error).replace("transducer.probe", "--probe")) from None
+    # The program's own probes have names without a suffix.
+    if Path(probe).suffix:
+        probe, texts = PROBE_FILE, {PROBE_FILE: read_text(Path(probe))}
     # Matplotlib and highdicom take 0.5 s to import.
     from scenes.patients.check_picture import as_table, draw_check, summary_rows
     from scenes.patients.import_request import import_request
     from scenes.patients.patient_complexity import complexity_of_patient
     from scenes.patients.patient_findings import findings_of
-    from scenes.patients.patient_scene import patient_scene
+    from scenes.patients.patient_scene import patient_scene, stiffness_row
 
     tissues = {TISSUE_OPTIONS[o]: label_words(text, o) for o, text in words.items() if text is not None}
     own = [] if organ is None else label_words(organ, "organ")
@@ -108,17 +136,18 @@ def import_patient_command(
     )
     complexity = complexity_of_patient(patient)
     written = public(patient)
-    rows = summary_rows(written, complexity)
-    texts = {
-        "scene.toml": scene_text(patient_scene(patient)),
+    scene = patient_scene(patient, uniform, probe, housing_mm)
+    rows = [*summary_rows(written, complexity), stiffness_row(scene)]
+    texts |= {
+        "scene.toml": scene_text(scene),
         FINDINGS_FILE: findings_text(findings_of(written, complexity)),
     }
     save_patient(written, out, texts, lambda folder: draw_check(written, rows, folder))
-    click.echo(as_table(summary_rows(patient, complexity)))
+    click.echo(as_table([*summary_rows(patient, complexity), stiffness_row(scene)]))
     if (written.notes, written.warnings) != (patient.notes, patient.warnings):
         click.echo("Names of labels that may be a person's are shown here, and are not in the files.")
     click.echo(
-        "The probe is linear, which shows most of a kidney; --probe drop-in is the robotic one.\n"
+        f"The probe is {probe}, on the organ over the {'middle' if patient.tumour is None else 'tumour'}; --probe gives another.\n"
         f"Written to {out}. Check {out / 'check.png'}, then: {shell_command('rehearse', out)}"
     )
 

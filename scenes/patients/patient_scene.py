@@ -1,16 +1,19 @@
-"""The scene of an imported patient: its files, the CT window, the hilum, the support."""
+"""The scene of an imported patient: its files, the materials of its parts, the CT window, the hilum, the support, the probe and where it starts."""
 
 import numpy as np
 import SimpleITK as sitk
 import trimesh
 
 from scenes.mechanical_tissues import mechanical_properties
+from scenes.patients.opening_pose import opening_press
 from scenes.patients.organ_selection import LESIONS, PARENCHYMA
 from scenes.patients.part_surfaces import PARTS
 from scenes.patients.patient_import import Patient
 from scenes.patients.patient_position import GRAVITY
 from scenes.patients.readers.segment_names import Side
-from scenes.scene import AnatomyFiles, Attachment, Gravity, Image, MeshShape, Scene
+from scenes.scene import AnatomyFiles, Attachment, Gravity, Image, MeshShape, Scene, Transducer
+from scenes.surfaces import depth_below_hull
+from scenes.tissue import NeoHookeanTissue, PartMaterial, PartName
 
 FAT_HU = -110.0
 LEAST_WINDOW_HU = 310.0  # up to 200 HU at least, or an unenhanced kidney is white
@@ -21,14 +24,17 @@ FLOOR_MM = 8.0
 PEDICLE_RADIUS_MM = 20.0
 # Least medial component of the normal at the hilum.
 LEAST_MEDIAL = 0.3
+# Parts that have their own material. Vessels have none: those within a kidney are smaller than its elements.
+STIFF_OR_SOFT: tuple[PartName, ...] = ("sinus", "urine", "cyst", "tumour")
+PROBE = "drop-in"
+# The housing of ``drop-in``, lateral x elevation x length.
+HOUSING_MM = (16.0, 9.0, 6.0)
 
 
 def hilum(organ: trimesh.Trimesh, side: Side) -> tuple[float, float, float]:
     """Centre of the hilum, LPS [mm]: around the medial vertex that is deepest below the surface's convex hull."""
     medial = np.array([-1.0 if side == "left" else 1.0, 0.0, 0.0])
-    hull = organ.convex_hull
-    normals, offsets = hull.face_normals, (hull.face_normals * hull.triangles[:, 0]).sum(axis=1)
-    depth = np.min(offsets - organ.vertices @ normals.T, axis=1)
+    depth = depth_below_hull(organ, organ.vertices)
     facing = organ.vertex_normals @ medial > LEAST_MEDIAL
     if not facing.any():
         facing[:] = True
@@ -38,8 +44,41 @@ def hilum(organ: trimesh.Trimesh, side: Side) -> tuple[float, float, float]:
     return x, y, z
 
 
-def patient_scene(patient: Patient) -> Scene:
-    """The scene that an import writes into the patient's folder: lying as in the CT, on its support."""
+def part_materials(patient: Patient) -> dict[PartName, PartMaterial]:
+    """The materials of the patient's parts: what is typical of each."""
+    typical = mechanical_properties().parts
+    return {
+        name: PartMaterial(**{key: values[1] for key, values in typical[name].model_dump().items()})
+        for name in STIFF_OR_SOFT
+        if name in patient.parts
+    }
+
+
+def stiffness_row(scene: Scene) -> tuple[str, str]:
+    """A row of the import's summary: Young's moduli of the scene's parts."""
+    tissue = scene.tissue
+    assert isinstance(tissue, NeoHookeanTissue)
+    if not tissue.parts:
+        return "stiffness", f"{tissue.young_kpa:g} kPa everywhere"
+    words = [
+        f"{PARTS[name].replace('-', ' ')} {part.young_kpa:g}" for name, part in reversed(tissue.parts.items())
+    ]
+    return (
+        "stiffness",
+        f"{', '.join([f'parenchyma {tissue.young_kpa:g}', *words])} kPa (typical values; --uniform: one for all)",
+    )
+
+
+def patient_scene(
+    patient: Patient,
+    uniform: bool = False,
+    probe: str = PROBE,
+    housing_mm: tuple[float, float, float] = HOUSING_MM,
+) -> Scene:
+    """The scene that an import writes into the patient's folder: lying as in the CT, on its support, under a probe.
+
+    ``uniform`` tissue has no parts of their own material.
+    """
     tumour = None if patient.tumour is None else "tumour.stl"
     own = [code for code, tissue in patient.tissues.items() if tissue in (*PARENCHYMA, *LESIONS)]
     hu = sitk.GetArrayViewFromImage(patient.ct)[np.isin(sitk.GetArrayViewFromImage(patient.labels), own)]
@@ -47,7 +86,7 @@ def patient_scene(patient: Patient) -> Scene:
     darkest = FAT_HU
     brightest = max(round(float(np.percentile(hu, 99)), -1), darkest + LEAST_WINDOW_HU)
     return Scene(
-        image=Image(window_hu=brightest - darkest, level_hu=(brightest + darkest) / 2),
+        image=Image(window_hu=brightest - darkest, level_hu=(brightest + darkest) / 2, outside="fluid"),
         title=f"{patient.side.capitalize()} kidney{' (draft)' if patient.draft else ''}",
         anatomy=AnatomyFiles.model_validate(
             dict(
@@ -58,6 +97,7 @@ def patient_scene(patient: Patient) -> Scene:
                 tissues={str(code): tissue for code, tissue in patient.tissues.items()},
             )
         ),
+        tissue=NeoHookeanTissue(parts={} if uniform else part_materials(patient)),
         gravity=Gravity(direction=GRAVITY[patient.position]),
         attachment=Attachment(
             at_mm=hilum(patient.organ, patient.side),
@@ -65,4 +105,8 @@ def patient_scene(patient: Patient) -> Scene:
             stiffness_n_mm=mechanical_properties().pedicle_n_mm[1],
         ),
         shape=(MeshShape(kind="mesh", file="support.stl"),),
+        transducer=Transducer(probe=probe),
+        press=opening_press(
+            patient.organ, patient.tumour, patient.support, GRAVITY[patient.position], housing_mm
+        ),
     )

@@ -41,7 +41,7 @@ from studies.study_options import open_study, out_option, scene_argument
 from studies.study_results import finish_axes, table_of, write_results
 from ultrasound.probe import DetailLevel, DopplerMode, Mode, Probe
 from ultrasound.probe_manipulator import ImagePlane, advanced, image_plane, pose_at, poses_between, touching
-from ultrasound.scanner import ScannedAnatomy, Scanner
+from ultrasound.scanner import ScannedAnatomy, Scanner, shows_ct
 
 # Depth and steps of the press, and the steps before it in which the body settles.
 PRESS_MM, PRESS_STEPS, SETTLE_STEPS = 8.0, 60, 30
@@ -264,11 +264,12 @@ def _images(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[str,
         ("B-mode: reflection, attenuation", "background", "b-mode", "reflection"),
         ("B-mode: and speckle", "background", "b-mode", "speckle"),
         ("B-mode: and elevation", "background", "b-mode", "elevation"),
+        ("B-mode: through fluid", "fluid", "b-mode", "speckle"),
         ("B-mode and CT", "background", "both", "speckle"),
     )
     cell = embedding_cell_mm(rehearsal.scene.tissue)
     for name, outside, mode, detail_level in levels:
-        margin = SURROUNDINGS_MM if outside == "background" else 0.0
+        margin = SURROUNDINGS_MM if shows_ct(outside) else 0.0
         embedding = Embedding(rehearsal.model, rehearsal.organ, cell, margin)
         scanner = Scanner(scanned, embedding, probe, image.pixels, outside)
 

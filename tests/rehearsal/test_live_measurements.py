@@ -23,7 +23,7 @@ FIRST, SECOND = straight_pass(4, step_mm=2.0), straight_pass(3, 20.0, 2.0)
 def rehearsal() -> SimpleNamespace:
     organ = trimesh.creation.icosphere(subdivisions=3, radius=25.0)
     tumour = trimesh.creation.icosphere(subdivisions=3, radius=6.0).apply_translation(12 * Z)
-    image = SimpleNamespace(contact_gap_mm=None)
+    image = SimpleNamespace(coupling_gap_mm=None)
     scene = SimpleNamespace(image=image, transducer=SimpleNamespace(compression_warning_mm=8.0))
     plane = SimpleNamespace(rest_grid=lambda count: np.full((count, count, 3), 500.0, np.float32))
     return SimpleNamespace(

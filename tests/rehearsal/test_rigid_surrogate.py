@@ -39,7 +39,7 @@ def surrogate_of(monkeypatch, probe) -> tuple[RigidSurrogate, Coverage]:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=TUMOUR_MM).apply_translation(AT)
     coverage = Coverage(big_ball(), ball)
     scene = SimpleNamespace(
-        image=SimpleNamespace(contact_gap_mm=GAP_MM),
+        image=SimpleNamespace(coupling_gap_mm=GAP_MM),
         transducer=SimpleNamespace(compression_warning_mm=WARNING_MM),
     )
     size = np.array(probe.housing_mm)

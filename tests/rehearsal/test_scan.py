@@ -16,10 +16,12 @@ from pydicom import dcmread
 import app
 from rehearsal.commands import scan_command
 from rehearsal.commands.scan_command import load_patient, warn_of_deep_poses
+from rehearsal.pose_scans import PoseScans
 from rehearsal.tracking.pose_file import PoseError, TimedPoses, load_poses, load_timed_poses
-from scenes.anatomy import LoadedAnatomy
+from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.phantom.embedded_patient import phantom_folder
-from scenes.scene import EMBEDDED, Scene
+from scenes.scene import EMBEDDED, Scene, load_scene
+from scenes.scene import Image as ImageSettings
 from scenes.surfaces import load_surface
 from ultrasound.probe import load_probe
 from version import VERSION
@@ -272,3 +274,23 @@ def test_a_label_of_no_known_tissue_is_refused_in_one_line(tmp_path, capsys):
     assert app.main(command) == 2
     told = capsys.readouterr().err
     assert "label 1 is 'kidny'" in told and "cortex" in told and len(told.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("contact", "outside", "has_fluid", "gap_mm"),
+    [
+        ("organ", "fluid", True, 4.0),
+        ("tissue", "fluid", False, 1.5),
+        ("organ", "background", False, 1.5),
+    ],
+)
+def test_through_the_organ_alone_it_scans_through_the_fluid_of_a_rehearsal(
+    one_device, tmp_path, contact, outside, has_fluid, gap_mm
+):
+    anatomy = load_anatomy(load_scene(EMBEDDED), EMBEDDED.parent)
+    ct = thinned(anatomy.ct)
+    settings = ImageSettings(outside=outside, pixels=32)
+    scans = PoseScans(
+        replace(anatomy, labels=None, ct=ct), ct, load_probe("drop-in"), settings, contact, tmp_path
+    )
+    assert (scans.scanner.has_fluid, scans.scanner.contact_gap_mm) == (has_fluid, gap_mm)

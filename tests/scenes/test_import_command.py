@@ -281,3 +281,53 @@ def test_a_seed_makes_a_draft(hospital, taken_in, monkeypatch):
         "scenes.patients.import_request.import_patient", lambda ct, labels, *_, **__: taken_in
     )
     assert import_request(hospital[0] / "ct", seed_mm=LEFT[0]).draft and not taken_in.draft
+
+
+class TestProbeAndStiffness:
+    """The options --probe and --uniform."""
+
+    def scene_of(self, hospital, tmp_path, *options):
+        out = tmp_path / "a"
+        assert main(["import", str(hospital[0]), "--side", "left", "--out", str(out), *options]) == 0
+        return load_scene(out / "scene.toml"), out
+
+    def test_by_default_the_drop_in_probe_is_over_a_stiff_tumour(self, written):
+        scene = load_scene(written / "scene.toml")
+        assert scene.transducer.probe == "drop-in" and scene.image.outside == "fluid"
+        assert scene.press.target_mm == pytest.approx(TUMOUR[0], abs=1.0)
+        assert {name: part.young_kpa for name, part in scene.tissue.parts.items()} == {"tumour": 60.0}
+
+    def test_uniform_tissue_under_a_probe_of_ones_own(self, hospital, tmp_path, capsys):
+        mine = tmp_path / "mine.toml"
+        mine.write_text('TransducerName = "Mine"\nHousingMm = [41.0, 9.0, 12.0]\n')
+        scene, out = self.scene_of(hospital, tmp_path, "--probe", str(mine), "--uniform")
+        assert scene.transducer.probe == str((out / "probe.toml").resolve())
+        assert (out / "probe.toml").read_text() == mine.read_text()
+        assert str(tmp_path) not in (out / "scene.toml").read_text()
+        assert scene.tissue.parts == {}
+        printed = capsys.readouterr().out
+        assert "stiffness  15 kPa everywhere" in printed and "The probe is probe.toml" in printed
+
+    def test_a_probe_by_name(self, hospital, tmp_path, capsys):
+        scene, out = self.scene_of(hospital, tmp_path, "--probe", "linear")
+        assert scene.transducer.probe == "linear" and not (out / "probe.toml").exists()
+        printed = capsys.readouterr().out
+        assert "parenchyma 15, tumour 60 kPa" in printed and "The probe is linear" in printed
+
+    @pytest.mark.parametrize(
+        ("name", "words"),
+        [
+            ("dropin", "--probe: 'dropin' is no file, and known by name are curvilinear, drop-in, linear, phased"),
+            ("none.toml", "--probe: 'none.toml' is no file"),
+            ("bad.toml", "TransducerWidthMm"),
+        ],
+    )  # fmt: skip
+    def test_a_probe_that_is_none_is_refused_before_the_ct_is_read(
+        self, tmp_path, capsys, monkeypatch, name, words
+    ):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "bad.toml").write_text('TransducerName = "Bad"\nTransducerWidthMm = -1.0\n')
+        assert main(["import", "no-such-ct", "--probe", name, "--out", "a"]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert words in line
+        assert not (tmp_path / "a").exists()

@@ -1,5 +1,6 @@
 """Scene files: what is refused, in which words, and what they load."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from scenes.phantom.embedded_patient import phantom_folder
 from scenes.scene import (
     EMBEDDED,
     AnatomyFiles,
+    Image,
     Press,
     Scene,
     SceneError,
@@ -294,3 +296,25 @@ def test_a_scenes_probes_file_lies_beside_it(tmp_path, monkeypatch):
     (tmp_path / "scenes" / "mine.toml").unlink()
     with pytest.raises(ProbeError, match="scenes.*mine.toml' is no file, and known by name are"):
         probe_of(scene)
+
+
+def test_fluid_couples_as_far_as_it_reaches():
+    dry, wet = Image(), Image(outside="fluid")
+    assert dry.coupling_gap_mm == dry.contact_gap_mm == 1.5 and wet.coupling_gap_mm == wet.fluid_gap_mm == 4.0
+    assert Image(outside="fluid", fluid_gap_mm=0.5).coupling_gap_mm == 1.5
+    assert Image(fluid_gap_mm=3.0).coupling_gap_mm == 1.5
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ('outside = "fluid"\ncontact = "tissue"', 'image.contact is "tissue": set it to "organ"'),
+        ('outside = "water"', "image.outside"),
+        ('outside = "fluid"\nfluid_gap_mm = 6.0', "image.fluid_gap_mm"),
+        ('outside = "fluid"\nfluid_gap_mm = -1.0', "image.fluid_gap_mm"),
+    ],
+)
+def test_fluid_that_cannot_be_is_refused(tmp_path, values, words):
+    (tmp_path / "scene.toml").write_text(f"[anatomy]\n[image]\n{values}\n")
+    with pytest.raises(SceneError, match=re.escape(words)):
+        load_scene(tmp_path / "scene.toml")

@@ -118,6 +118,15 @@ def test_sound_enters_as_near_to_the_organ_as_asked_for(usual, gap):
     assert echo(scanner, plane_at(gap + 0.4))[:40].max() < -170.0
 
 
+def test_sound_enters_through_fluid_and_the_ct_is_shown(usual):
+    scanner = Scanner(anatomy(), Unmoved(), PROBE, PIXELS, "fluid", contact_gap_mm=4.0)
+    assert echo(scanner, plane_at(3.6))[:40].max() > -100.0
+    assert echo(scanner, plane_at(4.4))[:40].max() < -170.0
+    for made in (scanner, usual):
+        made.locate(plane_at(3.0))
+    assert np.array_equal(scanner.ct_slice(400.0, 20.0), usual.ct_slice(400.0, 20.0))
+
+
 def test_beyond_the_ct_is_silence(usual):
     decibel = echo(usual, plane_at())
     depth = (np.arange(320) + 0.5) * PROBE.sample_mm
