@@ -44,11 +44,13 @@ OUTLINE = (
 # Structures that are derived from others by a margin or for the planning of a treatment, as TG-263 (doi 10.1016/j.ijrobp.2017.12.013) and
 # its users name them: PRV, CTV, PTV, ITV, a "z" before the name for optimisation, "~" for a part. A GTV is the tumour itself.
 DERIVED = (
-    r"\b(prv|(i ?)?[cp]tv|itv|i ?gtv)|\bring\b|\bopt(i|im|imi[sz]\w+)?\b|\bmargins?\b|\bbbox\b|bounding box|\bexp\b|\bexp(and|ans)\w+|\bdilat\w+|"
-    r"\bero(ded|sion)\b|\bshell\b|\bhull\b|\bhalo\b|\bavoid(ance)?\b|\beval\b|\bcropp?(ed)?\b|\bminus\b|\bsubtract\w*|\bwithout\b|\bexcl(uding)?\b|"
-    r"\bohne\b|\bsans\b|\b(iso)?dose\b|\bnormal tissue\b"
+    r"\b(prv|(i ?)?[cp]tv|itv|i ?gtv)|bounding box|normal tissue|"
+    r"\b(ring|rind|opt(i|im|imi[sz]\w+)?|margins?|bbox|exp(and\w*|ansion)?|dil(at\w+)?|ero(ded|sion)|shr[iu]nk\w*|grow\w*|shell|hull|halo|"
+    r"avoid(ance)?|eval|cropp?(ed)?|minus|subtract\w*|without|excl(uding)?|ohne|sans|(iso)?dose)\d*\b"
 )
 DERIVED_SIGNS = r"^z(?=[A-Z_ ])|~|[+-]\s*\d+([.,]\d+)?\s*(mm|cm)\b"
+# Of a kidney's name: the width of a margin. Of a tumour's it is the size.
+MARGIN = r"\d ?[mc]m\b"
 # "Kidney_L-GTV": the kidney without the tumour.
 DIFFERENCE = r"(?i)(.*\w)\s*[-–\\]\s*i?gtv"
 SIDE_OF_NAME: tuple[tuple[Side, str], ...] = (
@@ -347,9 +349,7 @@ PUBLIC_WORDS = frozenset(
 
 def tissue_of(name: str) -> str | None:
     """The tissue of ``ultrasound/acoustic_tissues.toml`` that a name means; None where it means none, or is of a derived structure."""
-    plain = _plain(name)
-    found = next((tissue for tissue, pattern in TISSUE_OF_NAME if re.search(pattern, plain)), "")
-    return None if is_derived(name) else found or None
+    return None if is_derived(name) else _tissue(name)
 
 
 def is_understood(name: str) -> bool:
@@ -362,10 +362,19 @@ def is_understood(name: str) -> bool:
 
 def is_derived(name: str) -> bool:
     """Whether a name is of a structure that was made from another, for example by a margin, and is no organ."""
-    if re.search(DERIVED, _plain(name)) or re.search(DERIVED_SIGNS, name):
+    plain = _plain(name)
+    if re.search(DERIVED, plain) or re.search(DERIVED_SIGNS, name):
         return True
     difference = re.match(DIFFERENCE, name)
-    return difference is not None and tissue_of(difference[1]) == "kidney"
+    if difference is not None and _tissue(difference[1]) == "kidney":
+        return True
+    return re.search(MARGIN, plain) is not None and _tissue(name) == "kidney"
+
+
+def _tissue(name: str) -> str | None:
+    """The tissue that a name means, also where it is of a derived structure."""
+    plain = _plain(name)
+    return next((tissue for tissue, pattern in TISSUE_OF_NAME if re.search(pattern, plain)), "") or None
 
 
 def is_far(name: str) -> bool:
