@@ -10,7 +10,7 @@ import SimpleITK as sitk
 from scipy import ndimage
 
 from scenes.patients.organ_selection import BODY_ABOVE_HU
-from scenes.patients.readers.label_maps import LabelMap, among
+from scenes.patients.readers.label_maps import LabelMap, among, resample_nearest
 from scenes.volumes.voxel_grid import VoxelGrid
 
 BONE_ABOVE_HU = 300
@@ -25,9 +25,12 @@ LIVER_LEFT_MM = 15.0
 CELL_MM = 4.0
 # The liver is the largest body of one HU on one side: enhanced 80 to 150 HU, unenhanced 40 to 65. Of the two CTs used in development it has 950
 # and 740 ml, and the largest other one (muscle of the back, stomach) 240 and 260 ml.
-LIVER_HU, HALF_WIDTH_HU, EVEN_SD_HU = range(15, 200, 15), 15.0, 25.0
+LIVER_HU, HALF_WIDTH_HU, EVEN_SD_HU = range(-15, 200, 15), 15.0, 25.0
 LEAST_LIVER_ML, CLEARLY, LEAST_LATERAL_MM = 400.0, 2.5, 30.0
-LUNG_HU, LEAST_LUNG_ML, LEAST_BELOW_MM = (-950.0, -500.0), 150.0, 20.0
+LABELLED_HU = -1000.0
+LUNG_HU, LEAST_LUNG_ML = (-950.0, -500.0), 150.0
+# The liver's middle and the lungs' are above the kidneys'.
+LEAST_BELOW_MM = 20.0
 
 
 def orientation_warnings(
@@ -45,10 +48,13 @@ def orientation_warnings(
     if _bones_ahead(overview):
         found.append("the bones are in front of the body's centre, not behind it; the CT may be turned over")
     grid, mean = _cells(overview)
-    if midline is not None and _liver_is_left(grid, mean, labels, midline):
+    liver = None if midline is None else _liver(grid, mean, labels, midline)
+    if liver is not None and midline is not None and liver[0] > midline + LIVER_LEFT_MM:
         found.append("the liver is on the patient's left; CT and labels may be mirrored")
-    if _lungs_below(grid, mean, organ_z_mm):
-        found.append("the lungs are below the kidney, not above it; the CT may be upside down")
+    below = {"lungs": _lungs_z(grid, mean), "liver": None if liver is None else liver[2]}
+    names = [name for name, z in below.items() if z is not None and z < organ_z_mm - LEAST_BELOW_MM]
+    if names:
+        found.append(f"{' and '.join(names)} are below the kidney's middle; the CT may be upside down")
     return tuple(f"{line}; compare check.png with the patient" for line in found)
 
 
@@ -76,20 +82,26 @@ def _cells(overview: sitk.Image) -> tuple[VoxelGrid, np.ndarray]:
     return VoxelGrid.of(shrunk), sitk.GetArrayFromImage(shrunk)
 
 
-def _liver_is_left(grid: VoxelGrid, mean: np.ndarray, labels: LabelMap, midline: float) -> bool:
-    """Whether the liver, as labelled or else by its size and HU, is clearly on the left."""
+def _liver(grid: VoxelGrid, mean: np.ndarray, labels: LabelMap, midline: float) -> np.ndarray | None:
+    """The middle (3,) of the liver, LPS [mm]: as labelled, or else of the clearly largest even body beside the midline."""
     liver = among(labels.values, labels.of_tissues("liver"))
     if liver.any():
         step = max(1, int(COARSE_MM / labels.grid.spacing.min()))
         coarse = liver[::step, ::step, ::step]
-        return bool(coarse.any()) and bool(_middle(labels.grid, coarse, step)[0] > midline + LIVER_LEFT_MM)
-    bodies = [(ml, x - midline) for ml, x in _even_bodies(grid, mean)]
-    left, right = (max((ml for ml, x in bodies if s * x > LEAST_LATERAL_MM), default=0.0) for s in (1, -1))
-    return left >= max(LEAST_LIVER_ML, CLEARLY * right)
+        return _middle(labels.grid, coarse, step) if coarse.any() else None
+    # What is labelled is something else, such as a large tumour.
+    unlabelled = np.where(resample_nearest(labels.grid, labels.values, grid) > 0, LABELLED_HU, mean)
+    bodies = [(ml, middle) for ml, middle in _even_bodies(grid, unlabelled)]
+    beside = [body for body in bodies if abs(body[1][0] - midline) > LEAST_LATERAL_MM]
+    if not beside:
+        return None
+    ml, middle = max(beside, key=lambda body: body[0])
+    others = [other for other, at in beside if (at[0] > midline) != (middle[0] > midline)]
+    return middle if ml >= max(LEAST_LIVER_ML, CLEARLY * max(others, default=0.0)) else None
 
 
-def _even_bodies(grid: VoxelGrid, mean: np.ndarray) -> Iterator[tuple[float, float]]:
-    """Volume [ml] and LPS x [mm] of the largest connected bodies of soft tissue of one HU."""
+def _even_bodies(grid: VoxelGrid, mean: np.ndarray) -> Iterator[tuple[float, np.ndarray]]:
+    """Volume [ml] and middle (3,), LPS [mm], of the largest connected bodies of soft tissue of one HU."""
     smooth = ndimage.uniform_filter(mean, 3)
     deviation = np.sqrt(np.maximum(ndimage.uniform_filter(mean**2, 3) - smooth**2, 0))
     for level in LIVER_HU:
@@ -99,17 +111,15 @@ def _even_bodies(grid: VoxelGrid, mean: np.ndarray) -> Iterator[tuple[float, flo
         parts, count = ndimage.label(ndimage.binary_opening(inside, iterations=2))
         if count:
             largest = parts == 1 + np.argmax(np.bincount(parts.ravel())[1:])
-            yield float(largest.sum() * grid.voxel_ml), float(_middle(grid, largest)[0])
+            yield float(largest.sum() * grid.voxel_ml), _middle(grid, largest)
 
 
-def _lungs_below(grid: VoxelGrid, mean: np.ndarray, organ_z_mm: float) -> bool:
-    """Whether there is a lung, and its middle is below a height, LPS z [mm]. Gas in the bowel is in smaller pieces."""
+def _lungs_z(grid: VoxelGrid, mean: np.ndarray) -> float | None:
+    """LPS z [mm] of the lungs' middle, if there are lungs. Gas in the bowel is in smaller pieces."""
     # A slice is a plane across the body's length in most CTs; in others the holes are open, and nothing is found.
     inside = ndimage.binary_fill_holes(mean > BODY_ABOVE_HU, np.ones((1, 3, 3)))
     parts, count = ndimage.label(ndimage.binary_opening(inside & (mean > LUNG_HU[0]) & (mean < LUNG_HU[1])))
     volumes = np.bincount(parts.ravel(), minlength=count + 1) * grid.voxel_ml
     volumes[0] = 0
     lungs = volumes[parts] >= LEAST_LUNG_ML
-    if not lungs.any():
-        return False
-    return bool(_middle(grid, lungs)[2] < organ_z_mm - LEAST_BELOW_MM)
+    return float(_middle(grid, lungs)[2]) if lungs.any() else None

@@ -9,6 +9,7 @@ import numpy as np
 
 from errors import PatientError
 from scenes.patient_space import Space
+from scenes.patients.organ_selection import organ_values
 from scenes.patients.patient_import import Patient, import_patient
 from scenes.patients.patient_position import Position
 from scenes.patients.readers.ct_series import ct_candidates, open_ct, read_dicom_headers
@@ -122,16 +123,20 @@ def organ_labels(
     assigned = assign_tissues(maps, organ, tissues, empty)
     drawn, notes_of_choice = choose_segments(assigned, [*organ, *chain(*tissues.values())], bool(organ))
     merged, own = merge_label_maps(drawn, organ)
+    sources: list[Segmentation | LabelMap] = [*segmentations, *maps]
+    # Several files of one kind have the same note.
+    notes = tuple(dict.fromkeys(note for source in sources for note in source.notes)) + notes_of_choice
+    try:
+        organ_values(merged, own)
+    except PatientError as error:
+        raise PatientError("; ".join([str(error), *notes])) from error
     absent = {tissue: absent_labels(maps, {tissue: words}) for tissue, words in tissues.items()}
     no_tumour = [f"{text}; the labels are {merged.listed()}" for text in absent.pop("tumour", ())]
-    # Several files of one kind have the same note.
-    sources: list[Segmentation | LabelMap] = [*segmentations, *maps]
-    notes = dict.fromkeys(note for source in sources for note in source.notes)
     return OrganLabels(
         merged=merged,
         own=own,
         drawn=tuple(drawn),
-        notes=(*notes, *notes_of_choice, *chain(*absent.values())),
+        notes=(*notes, *chain(*absent.values())),
         warnings=(*no_tumour, *chain(*(one.warnings for one in maps))),
     )
 

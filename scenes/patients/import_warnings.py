@@ -5,12 +5,15 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
-from scenes.patients.organ_selection import Organ
-from scenes.patients.readers.label_maps import LabelMap, box_of, listed
+from scenes.patients.organ_selection import HILAR, PARENCHYMA, Organ
+from scenes.patients.readers.label_maps import LESIONS, LabelMap, box_of, listed
+from scenes.patients.readers.segment_names import is_derived
 from scenes.volumes.voxel_grid import VoxelGrid
 
 # The outer shell of a correct label contains little fat; the sinus is deeper.
 SHELL_MM, FAT_BELOW_HU, MOST_FAT = 4.0, -60, 0.05
+# Tissues that are in a kidney, or at its hilum.
+OF_KIDNEY = (*PARENCHYMA, *LESIONS, *HILAR)
 # A segment touches an organ that is so many voxels away, and is in it with this share; beside it, less volume gives no warning.
 REACH, LEAST_WITHIN, LEAST_BESIDE_ML = 2, 0.5, 0.5
 MOST_PLACES = 100_000
@@ -19,16 +22,18 @@ STONE_ABOVE_MEDIAN_HU, LEAST_STONE_ML = 130.0, 0.1
 
 
 def fat_warnings(
-    grid: VoxelGrid, hounsfield: np.ndarray, organ: np.ndarray, parenchyma: np.ndarray
+    grid: VoxelGrid, hounsfield: np.ndarray, organ: np.ndarray, parenchyma: np.ndarray, slice_mm: float
 ) -> tuple[str, ...]:
     """A warning where much of an organ's outer shell is fat or gas: its label is shifted, mirrored or of another CT.
 
-    Of the organ (z, y, x) only the parenchyma counts: a tumour may contain fat.
+    Of the organ (z, y, x) only the parenchyma counts: a tumour may contain fat. A label whose slices are ``slice_mm`` apart ends in steps of
+    that height.
     """
     # A voxel beyond the organ's box is farther than one at its side.
     box = tuple(slice(max(0, a.start - 1), a.stop + 1) for a in box_of(organ)[::-1]) if organ.any() else ()
     depth = ndimage.distance_transform_edt(organ[box], sampling=grid.spacing[::-1])
-    rim = hounsfield[box][parenchyma[box] & (depth <= SHELL_MM)]
+    step_mm = max(0.0, 0.5 * (slice_mm - float(grid.spacing.max())))
+    rim = hounsfield[box][parenchyma[box] & (depth > step_mm) & (depth <= SHELL_MM + step_mm)]
     share = float((rim < FAT_BELOW_HU).mean()) if len(rim) else 0.0
     if share <= MOST_FAT:
         return ()
@@ -89,32 +94,36 @@ def label_warnings(
             f"labels {names} have no names, and were all taken as the kidney; if they are not, give --organ, --tumour, --cyst"
         )
     taken = [labels.segments[value] for value in piece.present]
-    near = ndimage.binary_dilation(np.pad(piece.mask, REACH), iterations=REACH)
+    filled = ndimage.binary_fill_holes(np.pad(piece.mask, REACH))
+    near = ndimage.binary_dilation(filled, iterations=REACH)
     for one in drawn:
         for value, segment in one.segments.items():
-            if segment.tissue is None and not segment.is_understood and segment not in taken:
-                found += _unknown_segment(one, value, piece, near)
+            if segment not in taken and segment.tissue not in OF_KIDNEY and not is_derived(segment.name):
+                found += _other_segment(one, value, piece, near)
     return tuple(found)
 
 
-def _unknown_segment(one: LabelMap, value: int, piece: Organ, near: np.ndarray) -> list[str]:
-    """A warning of a segment whose tissue is not known, where it is in an organ or touches it.
+def _other_segment(one: LabelMap, value: int, piece: Organ, near: np.ndarray) -> list[str]:
+    """A warning of a segment that is no part of a kidney: in an organ, or, where its tissue is not known, beside it.
 
-    ``near`` is the organ, dilated by REACH voxels.
+    ``near`` is the organ without hollows, dilated by REACH voxels.
     """
+    segment = one.segments[value]
     indices = np.argwhere(one.values == value)[:, ::-1]
     volume_ml = len(indices) * one.grid.voxel_ml
     places = one.grid.place(indices[:: max(1, len(indices) // MOST_PLACES)])
     share = _share_in(near, piece.grid.index(places) + REACH)
-    what = f"label {one.segments[value]} ({volume_ml:.1f} ml)"
     advice = "if it is the patient's tumour or cyst, give --tumour or --cyst with its name or value"
     if share >= LEAST_WITHIN:
+        known = "is of no tissue of a kidney" if segment.is_understood else "has no known tissue"
         return [
-            f"{what} in the organ has no known tissue, and is not shown, {_place(piece, places)}; {advice}"
+            f"label {segment} ({volume_ml:.1f} ml) in the organ {known}, and is not shown, {_place(piece, places)}; {advice}"
         ]
-    if share == 0 or volume_ml < LEAST_BESIDE_ML:
+    if segment.is_understood or segment.tissue is not None or share == 0 or volume_ml < LEAST_BESIDE_ML:
         return []
-    return [f"{what} touches the organ and has no known tissue, and was left out; {advice}"]
+    return [
+        f"label {segment} ({volume_ml:.1f} ml) touches the organ and has no known tissue, and was left out; {advice}"
+    ]
 
 
 def _share_in(mask: np.ndarray, indices: np.ndarray) -> float:

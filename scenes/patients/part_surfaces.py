@@ -64,9 +64,9 @@ def part_masks(labels: LabelMap, piece: Organ) -> PartMasks:
 def parts_elsewhere(
     labels: LabelMap, piece: Organ, pieces: Sequence[Organ], found: PartMasks, given: Collection[str]
 ) -> tuple[list[str], list[str]]:
-    """Notes and warnings of the given tissues whose labels are not in ``found``, the parts of one of the organs."""
+    """Notes and warnings of tissues whose labels are not in ``found``, the parts of one of the organs: the given ones, and tumours."""
     notes, warnings = [], []
-    for tissue in given:
+    for tissue in dict.fromkeys(["tumour", *given]):
         values = labels.of_tissues(tissue)
         part = "vessel" if tissue in VESSELS else tissue
         if not values or part not in PARTS or part in found:

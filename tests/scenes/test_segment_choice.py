@@ -120,6 +120,23 @@ class TestNames:
         assert tissue_of("Perirenal_Fat_L") == "fat"
 
 
+class TestComposite:
+    """A kidney with or without its tumour: the kidney, where no other is there."""
+
+    @pytest.mark.parametrize(
+        "name", ["Kidney_L-GTV", "kidney without mass", "Kidney_L + tumour", "Kidney_L incl GTV"]
+    )
+    def test_alone_and_beside_the_kidney(self, name):
+        assert tissue_of(name) == "kidney"
+        tumour = segment("GTV", TUMOUR)
+        assert organ_ml([segment(name, LEFT), tumour])[0] == pytest.approx(LEFT_ML + 2.5, rel=0.03)
+        ml, notes = organ_ml([segment(name, (LEFT[0], LEFT[1] + 2.0)), segment("Kidney_L", LEFT), tumour])
+        assert ml == pytest.approx(LEFT_ML + 2.5, rel=0.03) and f"“{name}”" in notes[0]
+
+    def test_a_hyphen_alone_joins(self):
+        assert tissue_of("Kidney-Tumor") == "tumour"
+
+
 class TestDerived:
     @pytest.mark.parametrize("name", ["Kidney_L_PRV5", "PTV_Kidney_L"])
     @pytest.mark.parametrize("is_first", [True, False])

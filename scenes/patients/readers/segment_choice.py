@@ -1,15 +1,16 @@
 """Which segments are which tissue: by the user's words, by their names, and not at all where a name is of a derived structure."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 from errors import PatientError
 from scenes.patients.readers.label_maps import LESIONS, LabelMap, Segment, listed, resample_nearest
-from scenes.patients.readers.segment_names import is_derived, is_public, quoted
+from scenes.patients.readers.segment_names import is_derived, is_plain_kidney, quoted, same_name
 
-# Segments of one tissue with this share of the smaller in common are the same structure, drawn twice.
-SAME_STRUCTURE = 0.5
+# Segments of one tissue that have this share of the larger in common are the same structure, drawn twice. A smaller one with this share of
+# its own in a kidney is something in it.
+SAME_STRUCTURE, WITHIN = 0.4, 0.5
 
 
 def assign_tissues(
@@ -33,6 +34,8 @@ def assign_tissues(
         PatientError: an absent label of the organ, a name that no segment has, or one segment given as two tissues.
     """
     segments = _segments(maps)
+    for word in [*organ, *(word for words in chosen.values() for word in words)]:
+        _check_unambiguous(word, segments)
     has_values = any(segment.value is not None for segment in segments)
     of_tissues = {word for words in chosen.values() for word in words}
     for option, words in {"organ": [word for word in organ if word not in of_tissues], **chosen}.items():
@@ -60,6 +63,20 @@ def assign_tissues(
         return replace(segment, tissue=segment.tissue or "kidney") if is_organ else segment
 
     return [replace(one, segments={v: assigned(s) for v, s in one.segments.items()}) for one in maps]
+
+
+def _check_unambiguous(word: str, segments: Sequence[Segment]) -> None:
+    """Raises PatientError where a word is the name of one segment and the value of another, or of names that differ in case alone."""
+    named = [segment for segment in segments if same_name(word, segment.name)]
+    valued = [segment for segment in segments if word == str(segment.value) and segment not in named]
+    if named and valued:
+        raise PatientError(
+            f"{quoted(word)} is the name of label {named[0]} and the value of label {valued[0]}; expected one meaning; rename one of them"
+        )
+    if len({segment.name for segment in named}) > 1:
+        raise PatientError(
+            f"{quoted(word)} is the name of {len(named)} labels, which differ in case alone: {_listed(named)}; give a value, or rename one"
+        )
 
 
 def absent_labels(maps: list[LabelMap], chosen: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
@@ -92,7 +109,8 @@ def choose_segments(
     """The maps without segments that are no organ, and notes that name these.
 
     Derived structures are left out, and so is a kidney that is drawn a second time under a longer name. Other segments that are one
-    structure drawn twice, such as two observers', are united when the maps are merged: a note names them.
+    structure drawn twice, such as two observers', are united when the maps are merged: a note names them. A small segment in a kidney whose
+    name has the word kidney and others is a finding of no known tissue.
 
     Args:
         maps: with the tissues that the user assigned.
@@ -107,18 +125,17 @@ def choose_segments(
         for segment in _segments(maps)
         if is_derived(segment.name) and not any(segment.matches(word) for word in words)
     ]
-    copies, united = _drawn_twice(maps, words, is_organ_named)
+    twice = _drawn_twice(maps, words, is_organ_named)
     notes = []
     if derived:
         notes.append(
             f"left out, as derived from other structures: {_listed(derived)}; --organ or --tumour with its name takes one"
         )
-    if copies:
-        notes.append(
-            f"left out, as the kidney is there under a plain name: {_listed(copies)}; --organ takes one"
-        )
-    notes += [f"united, as they are one structure drawn twice: {_listed(pair)}" for pair in united]
-    kept = _without(maps, [*derived, *copies])
+    if twice.copies:
+        names = _listed([*dict.fromkeys(twice.copies)])
+        notes.append(f"left out, as the kidney is there under a plain name: {names}; --organ takes one")
+    notes += [f"united, as they are one structure drawn twice: {_listed(pair)}" for pair in twice.united]
+    kept = _without(maps, [*derived, *twice.copies], twice.findings)
     if not kept:
         raise PatientError(
             f"the labels are only of structures that were derived from others: {_listed(derived)}; expected a kidney; choose other labels, "
@@ -131,42 +148,64 @@ def _listed(segments: Sequence[Segment]) -> str:
     return listed([str(segment) for segment in segments])
 
 
-def _drawn_twice(
-    maps: list[LabelMap], words: Collection[str], is_organ_named: bool
-) -> tuple[list[Segment], list[tuple[Segment, Segment]]]:
-    """Kidneys under a longer name where one with a plain name covers them, and pairs of other segments of one structure."""
-    copies, united = [], []
-    tissues = (*LESIONS, *(("kidney",) * (not is_organ_named)))
-    pieces = [(one, v, s) for one in maps for v, s in one.segments.items() if s.tissue in tissues]
+@dataclass(frozen=True)
+class _DrawnTwice:
+    """Segments that other segments of their tissue cover."""
+
+    copies: list[Segment]  # kidneys under a longer name than one that is there
+    united: list[tuple[Segment, Segment]]
+    findings: list[Segment]  # small, in a kidney
+
+
+def _drawn_twice(maps: list[LabelMap], words: Collection[str], is_organ_named: bool) -> _DrawnTwice:
+    twice = _DrawnTwice([], [], [])
+    pieces = [
+        (one, v, s) for one in maps for v, s in one.segments.items() if s.tissue in ("kidney", *LESIONS)
+    ]
     for (one, value, first), (other, other_value, second) in combinations(pieces, 2):
         if one is other or first.tissue != second.tissue:
             continue
-        if _share_in_common(one, value, other, other_value) < SAME_STRUCTURE:
+        of_larger, of_smaller, is_first_smaller = _shares_in_common(one, value, other, other_value)
+        longer = [
+            s for s in (first, second) if not is_plain_kidney(s.name) and not any(map(s.matches, words))
+        ]
+        smaller = first if is_first_smaller else second
+        is_kidney = first.tissue == "kidney"
+        if of_larger < SAME_STRUCTURE:
+            if is_kidney and of_smaller >= WITHIN and smaller in longer:
+                twice.findings.append(smaller)
+        elif is_kidney and is_organ_named:
             continue
-        longer = [s for s in (first, second) if not is_public(s.name) and not any(map(s.matches, words))]
-        if first.tissue == "kidney" and len(longer) == 1:
-            copies += longer
+        elif is_kidney and len(longer) == 1:
+            twice.copies.extend(longer)
         else:
-            united.append((first, second))
-    return copies, united
+            twice.united.append((first, second))
+    return twice
 
 
-def _share_in_common(one: LabelMap, value: int, other: LabelMap, other_value: int) -> float:
-    """The share of the smaller of two segments that both cover."""
+def _shares_in_common(
+    one: LabelMap, value: int, other: LabelMap, other_value: int
+) -> tuple[float, float, bool]:
+    """The share of the larger and of the smaller of two segments that both cover, and whether the first is smaller."""
     (low, high), (other_low, other_high) = one.grid.bounds(), other.grid.bounds()
     if (low > other_high).any() or (other_low > high).any():
-        return 0.0
-    mine = one.values == value
-    theirs = resample_nearest(other.grid, other.values == other_value, one.grid)
-    ml = mine.sum() * one.grid.voxel_ml, (other.values == other_value).sum() * other.grid.voxel_ml
-    return float((mine & theirs).sum() * one.grid.voxel_ml / max(min(ml), 1e-9))
+        return 0.0, 0.0, False
+    mine, its = one.values == value, other.values == other_value
+    ml, other_ml = float(mine.sum() * one.grid.voxel_ml), float(its.sum() * other.grid.voxel_ml)
+    both_ml = float((mine & resample_nearest(other.grid, its, one.grid)).sum() * one.grid.voxel_ml)
+    return both_ml / max(ml, other_ml), both_ml / min(ml, other_ml), ml < other_ml
 
 
-def _without(maps: list[LabelMap], left_out: Sequence[Segment]) -> list[LabelMap]:
-    """The maps without those of segments that are left out; beside others in a map, these have no tissue."""
+def _without(
+    maps: list[LabelMap], left_out: Sequence[Segment], findings: Sequence[Segment]
+) -> list[LabelMap]:
+    """The maps without those of segments that are left out; beside others in a map these have no tissue, as findings have none."""
     kept = []
     for one in maps:
-        segments = {v: replace(s, tissue=None) if s in left_out else s for v, s in one.segments.items()}
+        segments = {
+            v: replace(s, tissue=None) if s in left_out or s in findings else s
+            for v, s in one.segments.items()
+        }
         if any(segment not in left_out for segment in one.segments.values()):
             kept.append(replace(one, segments=segments))
     return kept

@@ -10,18 +10,18 @@ Side = Literal["left", "right"]
 # tumour and a kidney cyst a cyst, not a kidney. "": a known structure that is not modelled. English, and the words of German, French,
 # Spanish, Italian, Portuguese, Dutch, Chinese and Japanese that segments are commonly named with.
 TISSUE_OF_NAME: tuple[tuple[str, str], ...] = (
-    ("", r"adrenal|suprarenal|gall ?bladder|cystic duct|spleen|milza?\b|pancrea|stomach|colon|bowel|duoden|intestin|diaphragm|lymph(?!om)|skin|\bbody\b|external"),
+    ("", r"adrenal|suprarenal|gall ?bladder|cystic duct|spleen|splen|milz|\bbazo\b|pancrea|stomach|colon|bowel|duoden|intestin|diaphragm|lymph(?!om)|skin|\bbody\b|external"),
     ("tumour", r"tum(o|ou|eu)r|\bmass(es|e|a)?\b|\bmasas?\b|raumforderung|l(e|a|ae)sion|lesao|lesoes|laesie|neoplas|neoform|neubild|geschwulst|carcino|karzin|cancer|cancro|krebs|malign|"
                r"sar[ck]om|blastom|lymphom|metasta|adenom|nodul|knoten|nephrom|angiomyolip|\bamls?\b|on[ck]o[cz]yt|\b(cc|p|ch|nc)?rcc\b|\bgtv|肿瘤|腫瘍|腫瘤|肿块"),
     ("cyst", r"\bcysts?\b|zyste|\bkystes?\b|\bquistes?\b|\bcisti\b|\bcistos?\b|\bcysten?\b|bosniak|囊肿|嚢胞"),
     ("stone", r"\bstones?\b|calcul|lithiasis|litiasi|nierenstein|\bpiedras?\b|结石|結石"),
-    ("urine", r"collecting|renal pelvis|pelvis renal|pelvi renal|pelvical|caly[xc]|calic|ureter|urinary|urine|pyelo|bassinet|nierenbecken|kelch|harn|输尿管|尿管|肾盂|腎盂"),
+    ("urine", r"collecting|(kidney|renal) pelvis|pelvis (kidney|renal|of the kidney)|pelvi renal|pelvical|caly[xc]|calic|ureter|urinary|urine|pyelo|bassinet|nierenbecken|kelch|harn|输尿管|尿管|肾盂|腎盂"),
     ("vessel", r"arter(y|ies|ia)? (and|or|und|et) |vessel|vaisseau|gefa(e|s)?s|vascul|血管"),
     ("artery", r"arter|aorta|动脉|動脈"),
     ("vein", r"\bveins?\b|\bvenen?\b|nierenvene|\bvenas?\b|\bveine|\bveias?\b|venous|\bivc\b|静脉|静脈"),
     ("medulla", r"medulla|pyramid"),
     ("cortex", r"renal cortex|kidney cortex|cortex of (the )?kidney"),
-    ("sinus", r"renal sinus|sinus fat"),
+    ("sinus", r"(kidney|renal) sinus|sinus (fat|renal|of the kidney)|nierensinus"),
     ("fat", r"(peri|para)(renal|nephric) fat"),
     ("", r"fascia|gerota|(peri|para)(renal|nephr)|(kidney|renal|nephrectomy) (bed|capsule|hilum|hilus|space)\b"),
     ("kidney", r"kidneys?\b|\brenal\b|\bren\b|\brene\b|\breni\b|\brenes\b|\bniere|\bnier\b|\breins?\b|\brinon(es)?\b|\brim (direito|esquerdo)\b|\brins\b|肾|腎"),
@@ -46,13 +46,18 @@ OUTLINE = (
 DERIVED = (
     r"\b(prv|(i ?)?[cp]tv|itv|i ?gtv)|bounding box|normal tissue|"
     r"\b(ring|rind|opt(i|im|imi[sz]\w+)?|margins?|bbox|exp(and\w*|ansion)?|dil(at\w+)?|ero(ded|sion)|shr[iu]nk\w*|grow\w*|shell|hull|halo|"
-    r"avoid(ance)?|eval|cropp?(ed)?|minus|subtract\w*|without|excl(uding)?|ohne|sans|(iso)?dose)\d*\b"
+    r"avoid(ance)?|eval|cropp?(ed)?|(iso)?dose)\d*\b"
 )
-DERIVED_SIGNS = r"^z(?=[A-Z_ ])|~|[+-]\s*\d+([.,]\d+)?\s*(mm|cm)\b"
+DERIVED_SIGNS = r"^z(?=[A-Z_ ])|^_|~|\+\s*\d|-\s*\d+([.,]\d+)?\s*(mm|cm)\b"
 # Of a kidney's name: the width of a margin. Of a tumour's it is the size.
 MARGIN = r"\d ?[mc]m\b"
-# "Kidney_L-GTV": the kidney without the tumour.
-DIFFERENCE = r"(?i)(.*\w)\s*[-–\\]\s*i?gtv"
+# A kidney with or without its tumour, such as "Kidney_L-GTV", "kidney w/o mass", "Kidney + tumour": first the kidney, then the tumour.
+COMPOSITE = r"(?i)(.+?)(\bwith(out)?\b|\bw/o?\b|\bminus\b|\b(in|ex)cl\w*|\bohne\b|\bmit\b|\bsans\b|\bavec\b|\band\b|\bund\b|\bet\b|[+&]|\s[-–]\s|[-–](?=i?gtv))(.+)"
+# Organs whose lesions are not the kidney's, where a name has no word for a kidney.
+OTHER_ORGANS = (
+    r"\bliver|hepat|leber|foie|higado|figado|fegato|spleen|splen|milz|pancrea|colon|bowel|lung|pulmon|\bbone|knochen|osse(a|us)|vertebr|\bspine|spinal|"
+    r"\brib\b|brain|breast|thyroid|prostat|bladder|stomach|ovar|uter(us|ine)|thalam|\bskin"
+)
 SIDE_OF_NAME: tuple[tuple[Side, str], ...] = (
     ("left", r"\b(left|lt|l|links|linke[nrs]?|gauche|sinister|sinistr[aeo]|izquierd[ao]s?|esquerd[ao])\b|左"),
     (
@@ -60,304 +65,49 @@ SIDE_OF_NAME: tuple[tuple[Side, str], ...] = (
         r"\b(right|rt|r|rechts|rechte[nrs]?|droite?|dexter|dextra|destr[aeo]|derech[ao]s?|direit[ao])\b|右",
     ),
 )
+# The words of names that say nothing but a kidney, its side or its parts.
+KIDNEY_WORDS = frozenset(
+    re.findall(
+        r"\w+",
+        """
+    a all and both cortex droit droite gauche kidney kidneys l label left links lower lt middle native niere nieren normal of organ parenchyma part pole r
+    rechts rein ren renal rene right rt segment the total upper whole
+    """,
+    )
+)
 WITHHELD = "“...”"
+LEAST_DIGITS = 4
 # The words that names of segments may have in a patient's folder; a name with another word may be a person's.
 PUBLIC_WORDS = frozenset(
-    [
-        "a",
-        "abdominal",
-        "accessory",
-        "adenoma",
-        "adipose",
-        "adrenal",
-        "aml",
-        "and",
-        "angiomyolipoma",
-        "angiomyolipomas",
-        "aorta",
-        "arteria",
-        "arteries",
-        "artery",
-        "autochthon",
-        "avoid",
-        "back",
-        "bbox",
-        "befund",
-        "bladder",
-        "blood",
-        "body",
-        "bone",
-        "bones",
-        "bosniak",
-        "both",
-        "bowel",
-        "brachiocephalic",
-        "brain",
-        "bright",
-        "calyces",
-        "calyx",
-        "cancer",
-        "carcinoma",
-        "carotid",
-        "cartilage",
-        "cartilages",
-        "cava",
-        "ccrcc",
-        "central",
-        "chrcc",
-        "clavicula",
-        "clear",
-        "cm",
-        "collecting",
-        "collector",
-        "colon",
-        "contrast",
-        "cord",
-        "cortex",
-        "cortical",
-        "costal",
-        "couch",
-        "crop",
-        "ct",
-        "ctv",
-        "cyst",
-        "cystic",
-        "cysts",
-        "dark",
-        "deep",
-        "derecha",
-        "derecho",
-        "destro",
-        "direito",
-        "dose",
-        "draft",
-        "droit",
-        "droite",
-        "duct",
-        "duodenum",
-        "endophytic",
-        "esophagus",
-        "esquerdo",
-        "eval",
-        "exophytic",
-        "exp",
-        "expanded",
-        "external",
-        "face",
-        "fascia",
-        "fat",
-        "femur",
-        "finding",
-        "fluid",
-        "foie",
-        "gallbladder",
-        "gauche",
-        "gerota",
-        "gland",
-        "glands",
-        "gluteus",
-        "gtv",
-        "gtvn",
-        "gtvp",
-        "harnleiter",
-        "heart",
-        "hepatic",
-        "hilar",
-        "hilum",
-        "hip",
-        "hips",
-        "hull",
-        "humerus",
-        "i",
-        "igtv",
-        "ii",
-        "iii",
-        "iliac",
-        "iliopsoas",
-        "inferior",
-        "inner",
-        "intestine",
-        "itv",
-        "iv",
-        "ivc",
-        "izquierda",
-        "izquierdo",
-        "kidney",
-        "kidneys",
-        "knoten",
-        "kyste",
-        "l",
-        "label",
-        "laesion",
-        "large",
-        "lasion",
-        "lateral",
-        "leber",
-        "left",
-        "lesion",
-        "lesione",
-        "lesions",
-        "links",
-        "liver",
-        "lobe",
-        "lower",
-        "lt",
-        "lumbar",
-        "lung",
-        "lungs",
-        "lymph",
-        "main",
-        "margin",
-        "mass",
-        "masse",
-        "masses",
-        "maximus",
-        "medial",
-        "medius",
-        "medulla",
-        "metastasis",
-        "middle",
-        "milz",
-        "minimus",
-        "minus",
-        "mm",
-        "muscle",
-        "myocardium",
-        "necrosis",
-        "necrotic",
-        "niere",
-        "nieren",
-        "nierenarterie",
-        "nierenbecken",
-        "nierentumor",
-        "nierenvene",
-        "node",
-        "nodes",
-        "nodul",
-        "nodule",
-        "nodules",
-        "nodulo",
-        "nodulos",
-        "oesophagus",
-        "of",
-        "oncocytoma",
-        "opt",
-        "or",
-        "organ",
-        "outer",
-        "pancreas",
-        "papillary",
-        "pararenal",
-        "parenchyma",
-        "part",
-        "pelvis",
-        "perirenal",
-        "pole",
-        "portal",
-        "prcc",
-        "prostate",
-        "prv",
-        "psoas",
-        "ptv",
-        "pyramid",
-        "pyramids",
-        "quadratus",
-        "quiste",
-        "r",
-        "raumforderung",
-        "rcc",
-        "rechts",
-        "rein",
-        "ren",
-        "renal",
-        "renale",
-        "renalis",
-        "rene",
-        "rib",
-        "ribs",
-        "right",
-        "rim",
-        "ring",
-        "rinon",
-        "rinones",
-        "roi",
-        "rt",
-        "sacrum",
-        "scapula",
-        "segment",
-        "segments",
-        "shell",
-        "sinistro",
-        "sinus",
-        "skin",
-        "skull",
-        "small",
-        "solid",
-        "space",
-        "spinal",
-        "spine",
-        "spleen",
-        "splenic",
-        "sternum",
-        "stomach",
-        "stone",
-        "stones",
-        "subclavian",
-        "superior",
-        "system",
-        "table",
-        "target",
-        "the",
-        "thick",
-        "thin",
-        "thyroid",
-        "tissue",
-        "total",
-        "trachea",
-        "trunk",
-        "tumeur",
-        "tumor",
-        "tumors",
-        "tumour",
-        "tumours",
-        "upper",
-        "ureter",
-        "uretere",
-        "ureters",
-        "urinary",
-        "urine",
-        "v",
-        "vasos",
-        "vein",
-        "veins",
-        "vena",
-        "venous",
-        "vertebra",
-        "vertebrae",
-        "vessel",
-        "vessels",
-        "vi",
-        "wall",
-        "whole",
-        "with",
-        "z",
-        "zring",
-        "zyste",
-    ]
+    re.findall(
+        r"\w+",
+        """
+    a abdominal accessory adenoma adipose adrenal aml and angiomyolipoma angiomyolipomas aorta arteria arteries artery autochthon avoid bbox
+    bladder blood body bone bones bosniak both bowel brachiocephalic brain calyces calyx cancer carcinoma carotid cartilage cartilages cava
+    ccrcc chrcc clavicula cm collecting collector colon contrast cord cortex cortical costal couch crop ct ctv cyst cystic cysts derecha derecho
+    destro direito droit droite duct duodenum endophytic esophagus esquerdo eval exophytic exp expanded external fascia fat femur fluid foie
+    gallbladder gauche gerota gland glands gluteus gtv gtvn gtvp harnleiter heart hepatic hilar hilum hip hips hull humerus igtv ii iii iliac
+    iliopsoas inferior intestine itv iv ivc izquierda izquierdo kidney kidneys knoten kyste l label laesion lasion leber left lesion lesione
+    lesions links liver lobe lower lt lumbar lung lungs lymph margin mass masse masses maximus medius medulla metastasis middle milz minimus mm
+    muscle myocardium necrosis necrotic niere nieren nierenarterie nierenbecken nierentumor nierenvene node nodes nodul nodule nodules nodulo
+    nodulos oesophagus of oncocytoma opt or organ pancreas papillary pararenal parenchyma part pelvis perirenal pole portal prcc prostate prv
+    psoas ptv pyramid pyramids quadratus quiste r raumforderung rcc rechts renal renale renalis rib ribs right rinon rinones roi rt sacrum
+    scapula segment segments shell sinistro sinus skin skull spinal spine spleen splenic sternum stomach stone stones subclavian superior system
+    the thyroid tissue total trachea trunk tumeur tumor tumors tumour tumours upper ureter uretere ureters urinary urine vasos vein veins vena
+    venous vertebra vertebrae vessel vessels with z zring zyste
+    """,
+    )
 )
 
 
 def tissue_of(name: str) -> str | None:
     """The tissue of ``ultrasound/acoustic_tissues.toml`` that a name means; None where it means none, or is of a derived structure."""
-    return None if is_derived(name) else _tissue(name)
+    return None if is_derived(name) else _tissue(name) or None
 
 
 def is_understood(name: str) -> bool:
     """Whether a name is of a known structure, modelled or not."""
-    plain = _plain(name)
-    return bool(name) and (
-        is_derived(name) or any(re.search(pattern, plain) for _, pattern in TISSUE_OF_NAME)
-    )
+    return is_derived(name) or _tissue(name) is not None
 
 
 def is_derived(name: str) -> bool:
@@ -365,16 +115,25 @@ def is_derived(name: str) -> bool:
     plain = _plain(name)
     if re.search(DERIVED, plain) or re.search(DERIVED_SIGNS, name):
         return True
-    difference = re.match(DIFFERENCE, name)
-    if difference is not None and _tissue(difference[1]) == "kidney":
-        return True
     return re.search(MARGIN, plain) is not None and _tissue(name) == "kidney"
 
 
+def is_plain_kidney(name: str) -> bool:
+    """Whether a name is that of a kidney, or of a part of it, and says nothing else."""
+    return all(word in KIDNEY_WORDS for word in re.findall(r"[^\W\d_]+", _plain(name)))
+
+
 def _tissue(name: str) -> str | None:
-    """The tissue that a name means, also where it is of a derived structure."""
+    """The tissue that a name means, also where it is of a derived structure; "" of a known one that is not modelled; None without."""
     plain = _plain(name)
-    return next((tissue for tissue, pattern in TISSUE_OF_NAME if re.search(pattern, plain)), "") or None
+    found = next((tissue for tissue, pattern in TISSUE_OF_NAME if re.search(pattern, plain)), None)
+    if found in ("tumour", "cyst"):
+        parts = re.match(COMPOSITE, unicodedata.normalize("NFC", name))
+        if parts is not None and _tissue(parts[1]) == "kidney":
+            return "kidney"
+        is_renal = re.search(dict(TISSUE_OF_NAME)["kidney"], plain) is not None
+        return "" if re.search(OTHER_ORGANS, plain) and not is_renal else found
+    return found
 
 
 def is_far(name: str) -> bool:
@@ -388,9 +147,10 @@ def is_needless(name: str) -> bool:
 
 
 def is_public(name: str) -> bool:
-    """Whether all words of a name are of structures and sides, which identify nobody; numbers of up to three digits are no words."""
-    words = re.findall(r"[^\W\d_]+|\d{4,}", _plain(name))
-    return all(word in PUBLIC_WORDS for word in words)
+    """Whether all words of a name are of structures and sides, which identify nobody, and its digits are too few for a date or an ID."""
+    words = re.findall(r"[^\W\d_]+", _plain(name))
+    digits = sum(letter.isdigit() for letter in name)
+    return "^" not in name and digits < LEAST_DIGITS and all(word in PUBLIC_WORDS for word in words)
 
 
 def quoted(name: str) -> str:
@@ -412,8 +172,10 @@ def side_of(name: str) -> Side | None:
 
 def same_name(one: str, other: str) -> bool:
     """Whether two names are the same text but for case, and for how letters with accents are encoded."""
-    first, second = (unicodedata.normalize("NFC", name).casefold().strip() for name in (one, other))
-    return first == second
+    first, second = (
+        re.sub("[“”]", "", unicodedata.normalize("NFC", name)).casefold() for name in (one, other)
+    )
+    return first.strip() == second.strip()
 
 
 def _plain(name: str) -> str:
