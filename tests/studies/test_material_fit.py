@@ -33,7 +33,8 @@ def case(tmp_path_factory, one_device) -> BeadCase:
     written["material"]["part"] = [
         dict(name="sinus", surface="sinus.stl", young_kPa=5.0, poisson=0.45, density=1050.0)
     ]
-    core = trimesh.creation.icosphere(subdivisions=3, radius=7.0)
+    # Of a core of 7 mm (two thirds of that volume) beads and force hardly show the modulus: on one processor it was found 26 % off.
+    core = trimesh.creation.icosphere(subdivisions=3, radius=8.0)
     core.export(folder / "sinus.stl")
     empty = load_case(write_case(folder, written))
     experiment = BeadExperiment(empty, SETUP.but(**TRUE))
