@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from errors import PatientError
 from scenes.patients.readers.label_maps import LESIONS, LabelMap, among, box_of, listed
@@ -13,7 +12,6 @@ from scenes.patients.readers.segment_names import Side
 from scenes.volumes.voxel_grid import VoxelGrid
 
 ORGAN_FROM_ML = 20.0  # a smaller connected piece is an island of the label
-LEAST_ISLAND_ML = 1.0  # a smaller island is left out without a warning
 BODY_ABOVE_HU = -300.0
 BODY_WIDTH_MM = 150.0
 MIDLINE_MARGIN_MM = 10.0
@@ -74,42 +72,6 @@ def find_organs(labels: LabelMap, organ: Sequence[int] | None = None) -> list[Or
     masks = [_with_touching(parts, n, of_organ) for n in large]
     pieces = [_piece(labels, labels.grid.part(box), labels.values[part], mask, own) for mask in masks]
     return sorted(pieces, key=lambda piece: piece.centre_x_mm)
-
-
-def island_warnings(
-    labels: LabelMap, own: Sequence[int], pieces: Sequence[Organ], chosen: Organ
-) -> tuple[str, ...]:
-    """A warning of what is labelled as the organ, nearest to the chosen piece, and connected to none."""
-    apart = among(labels.values, own)
-    if (
-        apart.sum() - sum(np.isin(p.values[p.mask], own).sum() for p in pieces)
-    ) * labels.grid.voxel_ml < LEAST_ISLAND_ML:
-        return ()
-    for piece in pieces:
-        start = np.rint(labels.grid.index(piece.grid.origin)).astype(int)
-        apart[
-            tuple(slice(a, a + n) for a, n in zip(start[::-1], piece.mask.shape, strict=True))
-        ] &= ~piece.mask
-    parts, count = ndimage.label(apart, CORNERS)
-    found = []
-    for n in 1 + np.flatnonzero(
-        np.bincount(parts.ravel(), minlength=count + 1)[1:] * labels.grid.voxel_ml >= LEAST_ISLAND_ML
-    ):
-        places = labels.grid.place(np.argwhere(parts == n)[:, ::-1])
-        nearest = min(pieces, key=lambda piece: _distance_mm(piece, places))
-        if nearest is chosen:
-            x, y, z = places.mean(axis=0)
-            found.append(
-                f"{len(places) * labels.grid.voxel_ml:.1f} ml labelled as the organ, {_distance_mm(chosen, places):.0f} mm from it at "
-                f"{x:.0f}, {y:.0f}, {z:.0f} mm (LPS), were left out; correct the label if they are the organ's"
-            )
-    return tuple(found)
-
-
-def _distance_mm(piece: Organ, places: np.ndarray) -> float:
-    """Least distance of an organ's voxels from some places (n, 3), LPS [mm]."""
-    rim = piece.mask & ~ndimage.binary_erosion(piece.mask)
-    return float(cKDTree(piece.grid.place(np.argwhere(rim)[:, ::-1])).query(places)[0].min())
 
 
 def _with_touching(parts: np.ndarray, n: int, of_organ: list[int]) -> np.ndarray:

@@ -63,10 +63,10 @@ def part_masks(labels: LabelMap, piece: Organ) -> PartMasks:
 
 def parts_elsewhere(
     labels: LabelMap, piece: Organ, pieces: Sequence[Organ], found: PartMasks, given: Collection[str]
-) -> tuple[list[str], list[str]]:
-    """Notes and warnings of tissues whose labels are not in ``found``, the parts of one of the organs: the given ones, and tumours."""
-    notes, warnings = [], []
-    for tissue in dict.fromkeys(["tumour", *given]):
+) -> list[str]:
+    """Notes of the given tissues whose labels are not in ``found``, the parts of one of the organs."""
+    notes = []
+    for tissue in given:
         values = labels.of_tissues(tissue)
         part = "vessel" if tissue in VESSELS else tissue
         if not values or part not in PARTS or part in found:
@@ -75,11 +75,7 @@ def parts_elsewhere(
             notes.append(f"the {tissue}'s label is more than {PEDICLE_MM:g} mm from this kidney")
         elif any(np.isin(other.values[other.mask], values).any() for other in pieces if other is not piece):
             notes.append(f"the {tissue}'s label is only in the other kidney")
-        else:
-            warnings.append(
-                f"the {tissue}'s label touches no labelled kidney, and was left out; compare the labels with the CT"
-            )
-    return notes, warnings
+    return notes
 
 
 @contextmanager
@@ -138,7 +134,12 @@ def _surface(mask: sitk.Image, name: str, faces: int) -> trimesh.Trimesh:
     try:
         return surface_from_mask(mask, faces)
     except ValueError as error:
-        raise PatientError(f"the {name} has no surface: {error}; check the {name}'s label") from error
+        grid, inside = VoxelGrid.of(mask), sitk.GetArrayViewFromImage(mask) != 0
+        x, y, z = grid.place(np.argwhere(inside).mean(axis=0)[None, ::-1])[0]
+        raise PatientError(
+            f"the {name} has no surface: {error}; its label has {inside.sum()} voxels, {inside.sum() * grid.voxel_ml:.2f} ml, there, around "
+            f"{x:.0f}, {y:.0f}, {z:.0f} mm (LPS); remove them from the label, or draw it on smaller voxels"
+        ) from error
 
 
 def part_surface(grid: VoxelGrid, inside: np.ndarray, tissue: str) -> trimesh.Trimesh | None:

@@ -18,6 +18,7 @@ from scenes.patient_space import Space
 from scenes.patients.body_orientation import orientation_warnings
 from scenes.patients.import_warnings import fat_warnings, label_warnings, stone_warnings
 from scenes.patients.kidney_plausibility import kidney_warnings
+from scenes.patients.label_islands import island_warnings
 from scenes.patients.label_shift import shift_warnings
 from scenes.patients.missing_slices import fill_missing_slices
 from scenes.patients.organ_selection import (
@@ -27,7 +28,6 @@ from scenes.patients.organ_selection import (
     Organ,
     choose_organ,
     find_organs,
-    island_warnings,
     midline_x,
     organ_values,
 )
@@ -145,7 +145,7 @@ def import_patient(
         *label_warnings(labels, piece, organ is not None, drawn or [labels]),
     )
     found = part_masks(labels, piece)
-    part_notes, part_warnings = parts_elsewhere(labels, piece, pieces, found, given)
+    part_notes = parts_elsewhere(labels, piece, pieces, found, given)
     with part_surfaces_in_processes(found) as parts_made:
         surface = organ_surface(piece)
         _check_surface(surface, piece)
@@ -166,7 +166,7 @@ def import_patient(
         source=ct.grid,
         series=ct.series,
         notes=(*ct.notes, *position_notes, *part_notes),
-        warnings=(*warnings, *part_warnings),
+        warnings=warnings,
         colours=colours_of_labels(labels, [*parts]),
         position=actual_position,
     )

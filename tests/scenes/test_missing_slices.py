@@ -161,17 +161,3 @@ def test_a_slit_is_not_the_hilum(monkeypatch, thick, keep):
     patient = import_patient(LazyVolume.of(ct), labels, ORGAN, "left", margin_mm=10.0)
     np.testing.assert_allclose(hilum(patient.organ, "left"), sinus[0] + [14.0, 0, 0], atol=8.0)
     assert any("no kidney is labelled in the slice" in warning for warning in patient.warnings)
-
-
-@pytest.mark.parametrize("ml", [0.5, 4.0])
-def test_an_island_is_named(monkeypatch, thick, ml):
-    coarsely(monkeypatch)
-    radius = np.cbrt(ml * 1000 * 3 / (4 * np.pi))
-    island = LEFT[0] + [0, 0, 62.0], np.full(3, radius)
-    labels = label_map(drawn(thick[1], (1, RIGHT), (2, LEFT), (3, TUMOUR), (2, island)))
-    patient = import_patient(LazyVolume.of(thick[0]), labels, ORGAN, "left", margin_mm=10.0)
-    named = [line for line in patient.warnings if "labelled as the organ" in line and "were left out" in line]
-    assert len(named) == (ml > 1)
-    # Those of the other kidney are none of this patient's organ.
-    other = import_patient(LazyVolume.of(thick[0]), labels, ORGAN, "right", margin_mm=10.0)
-    assert not any("were left out" in line for line in other.warnings)
