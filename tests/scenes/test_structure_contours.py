@@ -197,14 +197,14 @@ class TestSolids:
         (solid,) = open_labels(path, wanted=["spleen"]).maps(grid_of(3.0))
         assert millilitres(wall) < 0.4 * millilitres(solid) and "differ" in solid.notes[0]
 
-    @pytest.mark.parametrize("apart", [0.5, 2.0])
+    @pytest.mark.parametrize("apart", [-0.5, 0.5, 2.0])
     def test_small_bodies_side_by_side(self, tmp_path, apart):
         """Two tumours, as large as two observers' contours are apart."""
         centres = CENTRE, CENTRE + [3.0 + apart, 0]
         contours = [loop(z, 1.5, centre) for z in (6.0, 9.0) for centre in centres]
         one, notes = single(tmp_path, grid_of(3.0), contours, "GTV")
         whole, _ = single(tmp_path, grid_of(3.0), [loop(z, 1.5) for z in (6.0, 9.0)], "GTV")
-        assert notes == [] and one.values.sum() > 1.6 * whole.values.sum()
+        assert not any("once" in note for note in notes) and one.values.sum() > 1.5 * whole.values.sum()
 
 
 def row_of_boxes(count, overlap):
@@ -246,9 +246,10 @@ class TestStrokes:
         around = [box(z, (5.5, 5.5), (45.5, 40.5)) for z in (6.0, 9.0)]
         one, _ = single(tmp_path, grid_of(3.0), strokes + around, name)
         assert one.values.sum() == 2 * (40 * 35 - 20 * 24)
-        at_edge = [box(z, (5.2, 14.5), (15.5, 20.5)) for z in (6.0, 9.0)]
+        around = [box(z, (5.1, 5.5), (45.5, 40.5)) for z in (6.0, 9.0)]
+        at_edge = [box(z, (4.9, 14.5), (15.5, 20.5)) for z in (6.0, 9.0)]
         one, notes = single(tmp_path, grid_of(3.0), around + at_edge, name)
-        assert one.values.sum() == 2 * (40 * 35 - 10 * 6) and notes == []
+        assert one.values.sum() == 2 * (40 * 35 - 10 * 6 + 6) and notes == []
 
 
 ROUNDS = {
