@@ -1,4 +1,4 @@
-"""Contours of a structure set: what stands twice counts once, and planes without a contour are interpolated, or refused."""
+"""Contours of a structure set: what stands twice counts once, strokes are united, and planes without a contour are interpolated, or refused."""
 
 import numpy as np
 import pytest
@@ -97,18 +97,20 @@ class TestCopies:
         assert millilitres(one) == pytest.approx(millilitres(plain), rel=2e-3)
         assert ndimage.label(one.values)[1] == 1
 
-    @pytest.mark.parametrize("kind", ["CLOSED_PLANAR", "CLOSEDPLANAR_XOR"])
+    @pytest.mark.parametrize(
+        ("name", "kind"), [("aorta", "CLOSED_PLANAR"), ("aorta", "CLOSEDPLANAR_XOR"), ("Kidney", "CLOSEDPLANAR_XOR")]
+    )  # fmt: skip
     @pytest.mark.parametrize(
         ("radius", "inner", "aside"), [(20.0, 10.0, 0.0), (20.0, 19.2, 0.0), (20.0, 19.0, 0.9), (2.5, 1.5, 0)]
     )
-    def test_a_hole_is_no_copy(self, tmp_path, kind, radius, inner, aside):
-        """Not in a wall of a pixel, nor where it is thin on one side alone."""
+    def test_a_hole_is_no_copy(self, tmp_path, name, kind, radius, inner, aside):
+        """Not in a wall of a pixel, nor where it is thin on one side alone; of an organ, where the file says so."""
         contours = [
             c
             for z in (6.0, 9.0)
             for c in (loop(z, radius, points=400), loop(z, inner, CENTRE + [aside, 0], 400))
         ]
-        one, notes = single(tmp_path, grid_of(3.0), contours, kind=kind)
+        one, notes = single(tmp_path, grid_of(3.0), contours, name, kind=kind)
         assert notes == []
         expected = 6 * np.pi * (radius**2 - inner**2) / 1000
         assert millilitres(one) == pytest.approx(expected, rel=0.08)
@@ -128,8 +130,174 @@ class TestCopies:
             box(6.0, low, high), 2, [[50.4, 20.4, 6], [50.4 + width, 20.4, 6], [50.4 + width, 26.4, 6], [50.4, 26.4, 6]], axis=0
         )  # fmt: skip
         contours = [c + [0, 0, z] for z in (0, 3.0) for c in (bumpy, box(6.0, low, high))]
-        one, notes = single(tmp_path, grid_of(3.0), contours)
+        one, notes = single(tmp_path, grid_of(3.0), contours, "aorta")
         assert notes == [] and one.values.sum() == 2 * 6 * width
+
+
+def moved(contours, mm):
+    return [c + [mm, 0, 0] for c in contours]
+
+
+def inset(contours, mm):
+    """Circles with smaller radii."""
+    middle = [*CENTRE, 0]
+    radii = [np.linalg.norm((c - middle)[:, :2], axis=1)[0] for c in contours]
+    return [loop(c[0, 2], r - mm) for c, r in zip(contours, radii, strict=True) if r > mm + 0.5]
+
+
+BALL = ball(3.0 * np.arange(60), 80.0, 20.0)
+# A second observer's contours.
+OTHERS = {
+    "moved by 0.4 mm": moved(BALL, 0.4),
+    "moved by 2.4 mm": moved(BALL, 2.4),
+    "moved by 4 mm": moved(BALL, 4.0),
+    "2 mm inside": inset(BALL, 2.0),
+    "10 % smaller": [c + 0.1 * ([*CENTRE, c[0, 2]] - c) for c in BALL],
+    "by two more": inset(BALL, 1.5) + inset(BALL, 3.5),
+}
+
+
+class TestSolids:
+    """An organ and its lesions are no thin shells: two observers' contours in one region."""
+
+    @pytest.mark.parametrize("name", ["Kidney", "GTV", "cyst"])
+    @pytest.mark.parametrize("other", OTHERS)
+    def test_two_observers(self, tmp_path, name, other):
+        plain, _ = single(tmp_path, grid_of(3.0), BALL, name)
+        one, notes = single(tmp_path, grid_of(3.0), BALL + OTHERS[other], name)
+        assert "counted once" in notes[0] and ("differ" in notes[0]) == (other != "moved by 0.4 mm")
+        assert all(np.array_equal(ndimage.binary_fill_holes(p), p) for p in one.values)
+        # Small sections at the ends, which share little, are united.
+        assert millilitres(one) == pytest.approx(millilitres(plain), rel=0.05)
+
+    def test_the_larger_one_counts(self, tmp_path):
+        for contours in (BALL + inset(BALL, 2.0), inset(BALL, 2.0) + BALL):
+            one, (note,) = single(tmp_path, grid_of(3.0), contours)
+            drawn = len(inset(BALL, 2.0))
+            assert note == (
+                f"region 1: contours that stand twice in a plane, counted once: {drawn}; {drawn} of them differ, and the larger one counts"
+            )
+            assert millilitres(one) == pytest.approx(millilitres(single(tmp_path, grid_of(3.0), BALL)[0]))
+
+    @pytest.mark.parametrize("radius", [12.0, 25.0])
+    @pytest.mark.parametrize("turn", [1, -1])
+    def test_a_hole_of_half_the_area(self, tmp_path, radius, turn):
+        """A wide sinus."""
+        contours = [c for z in (6.0, 9.0) for c in (loop(z, radius), loop(z, radius * np.sqrt(0.5))[::turn])]
+        one, notes = single(tmp_path, grid_of(3.0), contours)
+        assert notes == []
+        assert millilitres(one) == pytest.approx(6 * np.pi * radius**2 / 2 / 1000, rel=0.02)
+
+    def test_shells_are_of_other_structures(self, tmp_path):
+        """The wall of an aorta is one; what the user names as the patient's organ is none."""
+        contours = BALL + inset(BALL, 2.0)
+        wall, notes = single(tmp_path, grid_of(3.0), contours, "spleen")
+        assert notes == []
+        path = write_structures(tmp_path / "rt.dcm", {"spleen": contours})
+        (solid,) = open_labels(path, wanted=["spleen"]).maps(grid_of(3.0))
+        assert millilitres(wall) < 0.4 * millilitres(solid) and "differ" in solid.notes[0]
+
+    @pytest.mark.parametrize("apart", [-0.5, 0.5, 2.0])
+    def test_small_bodies_side_by_side(self, tmp_path, apart):
+        """Two tumours, as large as two observers' contours are apart."""
+        centres = CENTRE, CENTRE + [3.0 + apart, 0]
+        contours = [loop(z, 1.5, centre) for z in (6.0, 9.0) for centre in centres]
+        one, notes = single(tmp_path, grid_of(3.0), contours, "GTV")
+        whole, _ = single(tmp_path, grid_of(3.0), [loop(z, 1.5) for z in (6.0, 9.0)], "GTV")
+        assert not any("once" in note for note in notes) and one.values.sum() > 1.5 * whole.values.sum()
+
+
+def row_of_boxes(count, overlap):
+    """Boxes of 10 by 20 pixels beside each other, each ``overlap`` [pixels] over the next; at half pixels."""
+    steps = (10 - overlap) * np.arange(count) + 10.5
+    return [box(z, (x, 10.5), (x + 10, 30.5)) for z in (6.0, 9.0) for x in steps]
+
+
+class TestStrokes:
+    """Contours that cross are of one body."""
+
+    @pytest.mark.parametrize("name", ["Kidney", "aorta"])
+    @pytest.mark.parametrize(("count", "overlap"), [(2, 1), (2, 4), (3, 3), (4, 6)])
+    def test_are_united(self, tmp_path, name, count, overlap):
+        one, notes = single(tmp_path, grid_of(3.0), row_of_boxes(count, overlap), name)
+        assert notes == [f"region 1: contours that overlap in a plane, united: {2 * count}"]
+        assert one.values.all() and one.values.sum() == 2 * 20 * (10 * count - (count - 1) * overlap)
+
+    @pytest.mark.parametrize("share", [0.3, 0.9])
+    def test_leave_no_slit(self, tmp_path, share):
+        """Edges on both sides of a line of pixels."""
+        contours = [
+            c for z in (6.0, 9.0) for c in (box(z, (10.5, 10.5), (20 + share / 2, 30.5)), box(z, (20 - share / 2, 10.5), (30.5, 30.5)))
+        ]  # fmt: skip
+        one, _ = single(tmp_path, grid_of(3.0), contours)
+        assert one.values.all() and one.values.sum() == 2 * 20 * 20
+
+    def test_exclusive_contours(self, tmp_path):
+        one, notes = single(tmp_path, grid_of(3.0), row_of_boxes(3, 3), kind="CLOSEDPLANAR_XOR")
+        assert notes == [] and one.values.sum() == 2 * 20 * (3 * 10 - 4 * 3)
+
+    @pytest.mark.parametrize("name", ["Kidney", "aorta"])
+    def test_have_holes(self, tmp_path, name):
+        """In one of them, in a larger body's hole, and a hole that is drawn a little beyond the edge."""
+        strokes = row_of_boxes(3, 3)
+        holes = [box(z, (12.5, 14.5), (15.5, 20.5)) for z in (6.0, 9.0)]
+        one, _ = single(tmp_path, grid_of(3.0), strokes + holes, name)
+        assert one.values.sum() == 2 * (20 * 24 - 3 * 6)
+        around = [box(z, (5.5, 5.5), (45.5, 40.5)) for z in (6.0, 9.0)]
+        one, _ = single(tmp_path, grid_of(3.0), strokes + around, name)
+        assert one.values.sum() == 2 * (40 * 35 - 20 * 24)
+        around = [box(z, (5.1, 5.5), (45.5, 40.5)) for z in (6.0, 9.0)]
+        at_edge = [box(z, (4.9, 14.5), (15.5, 20.5)) for z in (6.0, 9.0)]
+        one, notes = single(tmp_path, grid_of(3.0), around + at_edge, name)
+        assert one.values.sum() == 2 * (40 * 35 - 10 * 6 + 6) and notes == []
+
+
+ROUNDS = {
+    "twice": lambda c: np.vstack([c, c]),
+    "twice, closed": lambda c: np.vstack([c, c[:1], c, c[:1]]),
+    "coarser": lambda c: np.vstack([c, c[::2]]),
+    "moved a little": lambda c: np.vstack([c, c + [0.1, 0, 0]]),
+    "four times": lambda c: np.vstack([c, c, c, c]),
+}
+
+
+@pytest.mark.parametrize("name", ["Kidney", "aorta"])
+@pytest.mark.parametrize("rounds", ROUNDS)
+@pytest.mark.parametrize("radius", [2.0, 20.0])
+def test_contours_that_go_round_twice(tmp_path, name, rounds, radius):
+    contours = [loop(3.0 * k, radius) for k in range(3, 9)]
+    plain, _ = single(tmp_path, grid_of(3.0), contours, name)
+    one, notes = single(tmp_path, grid_of(3.0), [ROUNDS[rounds](c) for c in contours], name)
+    assert notes == ["region 1: contours that stand twice in a plane, counted once: 6"]
+    assert np.array_equal(one.values, plain.values)
+
+
+class TestWithoutAPixel:
+    """A region that is smaller than a pixel."""
+
+    @pytest.mark.parametrize("heights", [(6.0,), (6.0, 9.0), (6.0, 7.1, 12.4)])
+    @pytest.mark.parametrize("name", ["GTV", "cyst"])
+    def test_of_an_organ_is_marked(self, tmp_path, heights, name):
+        contours = [loop(z, 0.3, [40.4, 30.6]) for z in heights]
+        one, _ = single(tmp_path, grid_of(3.0), contours, name)
+        assert any(f"“{name}” is smaller than a pixel" in line for line in one.warnings)
+        places = one.grid.place(np.argwhere(one.values)[:, ::-1])
+        assert np.abs(places[:, :2] - [40, 31]).max() < 1e-6
+        assert {min(heights, key=lambda z, at=at: abs(z - at)) for at in places[:, 2]} == set(heights)
+
+    def test_of_the_user_is_marked(self, tmp_path):
+        """What the user names; of other structures, nothing is left."""
+        regions = {"Kidney": BALL, "aorta": [loop(60.0, 0.3, [40.4, 30.6])]}
+        path = write_structures(tmp_path / "rt.dcm", regions)
+        assert len(open_labels(path).maps(grid_of(3.0))) == 1
+        _, one = open_labels(path, wanted=["aorta"]).maps(grid_of(3.0))
+        assert one.values.sum() == 1 and "“aorta” is smaller than a pixel" in one.warnings[0]
+
+    def test_specks_beside_a_body(self, tmp_path):
+        """A contour without a pixel is none of a region that has some."""
+        one, notes = single(tmp_path, grid_of(3.0), [*BALL, loop(60.0, 0.3, [10.4, 10.6])])
+        plain, _ = single(tmp_path, grid_of(3.0), BALL)
+        assert one.values.sum() == plain.values.sum() and notes == []
 
 
 class TestOnPixels:

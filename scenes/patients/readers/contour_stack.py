@@ -9,8 +9,9 @@ import numpy as np
 from scipy import ndimage
 
 from errors import PatientError
-from scenes.patients.readers.contour_fill import fill, without_copies
-from scenes.patients.readers.label_maps import box_of, listed
+from scenes.patients.readers.contour_fill import COPY_PIXELS, fill_plane
+from scenes.patients.readers.label_maps import Segment, box_of, listed
+from scenes.patients.readers.segment_names import quoted
 from scenes.patients.readers.slice_stack import UNEVEN
 from scenes.terminal import Progress
 from scenes.volumes.voxel_grid import Box, VoxelGrid
@@ -27,6 +28,24 @@ WIDER = 2.5
 LACKS = 1.5
 # Neighbouring planes of one body share so much of the smaller one's area.
 LEAST_OVERLAP = 0.25
+
+
+# The walls of an organ and its lesions are thicker; two contours of one organ, by two observers, may be as far apart.
+WALL_MM = 2.5
+
+
+@dataclass(frozen=True)
+class DrawnRegion:
+    """A region's contours."""
+
+    file: str
+    segment: Segment
+    contours: list[np.ndarray]  # corners (n, 3) of each closed contour, LPS [mm]
+    is_organ: bool  # whether no part of it must be lost, and it is solid: it is no thin shell
+    is_exclusive: bool  # whether its contours are exclusive where they cross, too (CLOSEDPLANAR_XOR)
+
+    def __str__(self) -> str:
+        return f"{self.file}: region {self.segment}"
 
 
 @dataclass(frozen=True)
@@ -67,25 +86,24 @@ class _Planes:
 
 
 def stack_contours(
-    name: str, contours: list[np.ndarray], ct: VoxelGrid, near: Box | None, is_organ: bool, progress: Progress
+    region: DrawnRegion, ct: VoxelGrid, near: Box | None, progress: Progress
 ) -> FilledRegion | None:
     """A region on planes of its contours, or on the CT's where these are uneven; in each a CT's pixels. None where none is near.
 
-    Nested contours on one plane alternate between inside and outside; a contour that stands there twice counts once.
+    Nested contours on one plane alternate between inside and outside; contours that cross are united; a contour that stands there
+    twice counts once. An organ that has no pixel gets those nearest to its contours, with a warning.
 
     Args:
-        name: of the file and region, for errors.
-        contours: corners (n, 3) of each, LPS [mm].
+        region: its contours; of an organ, gaps that are too wide to interpolate are refused.
         ct: the CT's voxels.
         near: the box of voxels outside which nothing is filled; None: all is filled.
-        is_organ: whether a part of the region must not be lost: gaps that are too wide to interpolate are refused.
         progress: shows the progress of the planes.
 
     Raises:
         PatientError: far outside the CT, not parallel to its slices, or with a gap that is too wide.
     """
-    places = [ct.index(corners) for corners in contours]
-    _check_places(name, places, ct)
+    places = [ct.index(corners) for corners in region.contours]
+    _check_places(str(region), places, ct)
     ends = np.array(ct.size)
     least, most = (-ends, 2 * ends) if near is None else np.array([(a.start, a.stop - 1) for a in near]).T
     places = [p for p in places if (p.max(axis=0) >= least).all() and (p.min(axis=0) <= most).all()]
@@ -101,23 +119,45 @@ def stack_contours(
     levels, step = _even_planes(heights, slice_mm)
     origin = ct.place(np.array([low[0], low[1], levels[0]]))
     size = columns, rows, max(2, len(levels))
-    grid = VoxelGrid(size, ct.spacing * (1, 1, step), origin, ct.direction).checked(name)
+    grid = VoxelGrid(size, ct.spacing * (1, 1, step), origin, ct.direction).checked(str(region))
 
-    inside, copies = np.zeros((len(groups), rows, columns), bool), 0
-    for plane, group in progress(list(zip(inside, groups, strict=True)), "contours"):
-        corners = without_copies([places[n][:, 1::-1] - low[::-1] for n in group])
-        copies += len(group) - len(corners)
-        plane[:] = fill(corners, plane.shape)
-    notes = (f"contours that stand twice in a plane, counted once: {copies}",) * bool(copies)
-    warnings: tuple[str, ...] = ()
-    if len(levels) != len(heights) or np.abs(levels - heights).max() > ON_PLANE * step:
-        inside, of_planes, warnings = _on_levels(
-            name, _Planes(heights, inside, low, ct), levels, step, is_organ
+    wall = np.maximum(WALL_MM / ct.spacing[1::-1], COPY_PIXELS) if region.is_organ else None
+    drawn = [[places[n][:, 1::-1] - low[::-1] for n in group] for group in groups]
+    inside, counts = np.zeros((len(groups), rows, columns), bool), np.zeros(3, int)
+    for plane, corners in progress(list(zip(inside, drawn, strict=True)), "contours"):
+        one = fill_plane(corners, plane.shape, wall, region.is_exclusive)
+        plane[:] = one.inside
+        counts += one.copies, one.differing, one.united
+    notes, warnings = _notes(*counts.tolist()), tuple[str, ...]()
+    if region.is_organ and not inside.any():
+        _mark_nearest(inside, drawn)
+        name = quoted(region.segment.name)
+        warnings = (
+            f"{name} is smaller than a pixel: no contour encloses a pixel's centre; the pixel nearest to the middle of each was marked",
         )
-        notes += of_planes
+    if len(levels) != len(heights) or np.abs(levels - heights).max() > ON_PLANE * step:
+        planes = _Planes(heights, inside, low, ct)
+        inside, uneven, lacking = _on_levels(region, planes, levels, step)
+        notes, warnings = (*notes, *uneven), (*warnings, *lacking)
     if len(inside) < size[2]:
         inside = np.concatenate([inside, np.zeros_like(inside)])
     return FilledRegion(grid, inside, notes, warnings)
+
+
+def _notes(copies: int, differing: int, united: int) -> tuple[str, ...]:
+    """What was mended in the planes."""
+    by_others = f"; {differing} of them differ, and the larger one counts" if differing else ""
+    twice = f"contours that stand twice in a plane, counted once: {copies}{by_others}"
+    crossing = f"contours that overlap in a plane, united: {united}"
+    return (twice,) * bool(copies) + (crossing,) * bool(united)
+
+
+def _mark_nearest(inside: np.ndarray, drawn: list[list[np.ndarray]]) -> None:
+    """Mark, in planes (n, y, x), the pixel nearest to the middle of each contour, whose corners are rows and columns [pixels]."""
+    last = np.array(inside.shape[1:]) - 1
+    for plane, contours in zip(inside, drawn, strict=True):
+        for corners in contours:
+            plane[tuple(np.clip(np.rint(corners.mean(axis=0)), 0, last).astype(int))] = True
 
 
 def _check_places(name: str, places: list[np.ndarray], ct: VoxelGrid) -> None:
@@ -167,10 +207,10 @@ def _usual(gaps: np.ndarray) -> float:
 
 
 def _on_levels(
-    name: str, drawn: _Planes, levels: np.ndarray, step: float, is_organ: bool
+    region: DrawnRegion, drawn: _Planes, levels: np.ndarray, step: float
 ) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
     """The mask on even planes (``levels``, ``step`` [slices]): as drawn, interpolated, or as the nearest plane at an end; notes and warnings."""
-    continues, warnings = _continues(name, drawn, is_organ)
+    continues, warnings = _continues(region, drawn)
     gaps = np.diff(drawn.heights)
     usual = _usual(gaps)
     inside = np.zeros((len(levels), *drawn.inside.shape[1:]), bool)
@@ -202,7 +242,7 @@ def _on_levels(
     return inside, notes, warnings
 
 
-def _continues(name: str, drawn: _Planes, is_organ: bool) -> tuple[list[bool], tuple[str, ...]]:
+def _continues(region: DrawnRegion, drawn: _Planes) -> tuple[list[bool], tuple[str, ...]]:
     """Whether one body is on both sides of each gap between planes, and the gap can be interpolated; and warnings.
 
     The sections beside it overlap, and the gap is not much wider than one beside it, or one of the sections is no end of a body.
@@ -223,9 +263,9 @@ def _continues(name: str, drawn: _Planes, is_organ: bool) -> tuple[list[bool], t
         continues.append(is_one and gap <= MOST_GAP_MM)
         if is_one and gap > MOST_GAP_MM:
             between = " and ".join(map(drawn.place, drawn.heights[n : n + 2]))
-            if is_organ:
+            if region.is_organ:
                 raise PatientError(
-                    f"{name} has no contour between {between} mm; expected at most {MOST_GAP_MM:g} mm without one; draw the contours "
+                    f"{region} has no contour between {between} mm; expected at most {MOST_GAP_MM:g} mm without one; draw the contours "
                     "between, or make its parts regions of their own"
                 )
             warnings += (f"a gap too wide to interpolate was left empty, between {between} mm",)

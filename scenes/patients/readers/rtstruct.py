@@ -7,7 +7,7 @@ import numpy as np
 from pydicom.dataset import Dataset
 
 from errors import PatientError, parsing
-from scenes.patients.readers.contour_stack import stack_contours
+from scenes.patients.readers.contour_stack import DrawnRegion, stack_contours
 from scenes.patients.readers.dicom_files import SourceFile
 from scenes.patients.readers.label_headers import references_of
 from scenes.patients.readers.label_maps import (
@@ -24,7 +24,8 @@ from scenes.volumes.voxel_grid import VoxelGrid
 
 MOST_POINTS = 20_000_000
 # Values of ContourGeometricType that enclose an area, as they are and without underscores.
-CLOSED = {"CLOSEDPLANAR", "CLOSEDPLANARXOR", "INTERPOLATEDPLANAR"}
+EXCLUSIVE = "CLOSEDPLANARXOR"
+CLOSED = {"CLOSEDPLANAR", EXCLUSIVE, "INTERPOLATEDPLANAR"}
 # Tissues of the organ and its lesions, of which no part may be lost.
 ORGAN = {"kidney", "tumour", "cyst"}
 # Values of RTROIInterpretedType that are no tissue.
@@ -48,24 +49,22 @@ def read_structures(
     """
     data = item.parsed()
     with parsing(f"{item.name}: cannot be read as an RTSTRUCT", "export it again"):
-        contours: list[tuple[Segment, list[np.ndarray]]] = []
-        left_out = []
+        regions, left_out = [], []
         for segment, roi, kind in _regions(data):
             if is_left_out(segment, wanted, kind not in NO_TISSUE):
                 left_out.append(segment)
             else:
-                contours.append((segment, _contours(roi)))
+                regions.append(_drawn(item.name, segment, roi, wanted))
     references = references_of(data)
     if len(references.frames) > 1:
         raise PatientError(
             f"{item.name}: its regions are in {len(references.frames)} frames of reference; expected one; export the regions of one CT"
         )
-    empty = tuple(segment for segment, points in contours if not points)
+    empty = tuple(region.segment for region in regions if not region.contours)
     notes = (*note_of_left_out(left_out), *_note_of_empty(empty))
 
     def maps(ct: VoxelGrid) -> list[LabelMap]:
-        drawn = [(segment, points) for segment, points in contours if points]
-        filled = _filled_regions(item.name, drawn, ct, wanted, progress)
+        filled = _filled_regions([region for region in regions if region.contours], ct, progress)
         if not filled:
             why = "".join(f" ({note})" for note in notes)
             raise PatientError(
@@ -100,33 +99,28 @@ def _regions(data: Dataset) -> list[tuple[Segment, Dataset, str]]:
     ]
 
 
-def _filled_regions(
-    name: str,
-    regions: list[tuple[Segment, list[np.ndarray]]],
-    ct: VoxelGrid,
-    wanted: Collection[str],
-    progress: Progress,
-) -> list[LabelMap]:
+def _filled_regions(regions: list[DrawnRegion], ct: VoxelGrid, progress: Progress) -> list[LabelMap]:
     """The regions that have contours; where there are kidneys, the others only near them."""
-    kidneys = [points for segment, contours in regions if segment.tissue == "kidney" for points in contours]
+    kidneys = [
+        points for region in regions if region.segment.tissue == "kidney" for points in region.contours
+    ]
     near = None
     if kidneys:
         places = np.concatenate(kidneys)
         near = ct.box_around(places.min(axis=0) - NEAR_MM, places.max(axis=0) + NEAR_MM)
-    filled = []
-    for segment, contours in regions:
-        box = None if segment.tissue == "kidney" else near
-        is_organ = segment.tissue in ORGAN or any(segment.matches(word) for word in wanted)
-        region = stack_contours(f"{name}: region {segment}", contours, ct, box, is_organ, progress)
-        if region and region.inside.any():
+    maps = []
+    for region in regions:
+        segment = region.segment
+        filled = stack_contours(region, ct, None if segment.tissue == "kidney" else near, progress)
+        if filled and filled.inside.any():
             notes, warnings = (
                 tuple(f"region {segment.value}: {line}" for line in lines)
-                for lines in (region.notes, region.warnings)
+                for lines in (filled.notes, filled.warnings)
             )
-            one = LabelMap.single(region.grid, region.inside, segment)
-            notes, warnings = (notes, warnings) if is_organ else ((*notes, *warnings), ())
-            filled.append(replace(one, notes=notes, warnings=warnings))
-    return filled
+            one = LabelMap.single(filled.grid, filled.inside, segment)
+            notes, warnings = (notes, warnings) if region.is_organ else ((*notes, *warnings), ())
+            maps.append(replace(one, notes=notes, warnings=warnings))
+    return maps
 
 
 def _colour(roi: Dataset) -> tuple[float, float, float] | None:
@@ -137,17 +131,22 @@ def _colour(roi: Dataset) -> tuple[float, float, float] | None:
     return red, green, blue
 
 
-def _contours(roi: Dataset) -> list[np.ndarray]:
-    """Points (n, 3) of each closed contour, LPS [mm]."""
+def _drawn(file: str, segment: Segment, roi: Dataset, wanted: Collection[str]) -> DrawnRegion:
+    """A region's closed contours. Raises ValueError where they are damaged."""
     closed = [
-        c
-        for c in roi.get("ContourSequence") or []
-        if str(c.get("ContourGeometricType") or "").strip().upper().replace("_", "") in CLOSED
+        (kind, one) for one in roi.get("ContourSequence") or [] for kind in [_kind(one)] if kind in CLOSED
     ]
-    points = [_points(c) for c in closed]
+    points = [_points(one) for _, one in closed]
     if sum(map(len, points)) > MOST_POINTS or not all(np.isfinite(p).all() for p in points):
         raise ValueError
-    return [p for p in points if len(p) >= 3]
+    is_organ = segment.tissue in ORGAN or any(segment.matches(word) for word in wanted)
+    is_exclusive = any(kind == EXCLUSIVE for kind, _ in closed)
+    return DrawnRegion(file, segment, [p for p in points if len(p) >= 3], is_organ, is_exclusive)
+
+
+def _kind(contour: Dataset) -> str:
+    """The type of a contour, without underscores."""
+    return str(contour.get("ContourGeometricType") or "").strip().upper().replace("_", "")
 
 
 def _points(contour: Dataset) -> np.ndarray:
