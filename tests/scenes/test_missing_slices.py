@@ -128,6 +128,16 @@ class TestLeft:
         labels = without(thick[1], range(k - 2, k + 3))
         assert_left(labels, ORGAN)
 
+    @pytest.mark.parametrize("apart_mm", [11.0, 16.0])
+    @pytest.mark.parametrize("axis", [0, 1, 2])
+    def test_two_bodies_that_face_each_other(self, axis, apart_mm):
+        """Between the ends of a kidney and of an island there are no missing slices."""
+        empty = grid_around((20, -40, -100), (160, 120, 120), (2.5, 2.5, 2.5))
+        beside = np.zeros(3)
+        beside[axis] = LEFT[1][axis] + 14.0 + apart_mm
+        labels = label_map(drawn(empty, (2, LEFT), (2, (LEFT[0] + beside, np.full(3, 14.0)))))
+        assert_left(labels, [2])
+
     def test_two_tumours_apart(self):
         empty = grid_around((30, -10, -60), (130, 80, 80), (2.0, 2.0, 3.0))
         small = np.full(3, 7.0)
