@@ -152,6 +152,10 @@ class DistanceShape(Section):
 Shape = Annotated[PlaneShape | MeshShape | DistanceShape, Field(discriminator="kind")]
 
 
+# Of a probe's housing, as in its file.
+ProbeLength = Annotated[float, Field(gt=0, le=150)]
+
+
 class Transducer(Section):
     """A probe: the name of one in ``ultrasound/probes``, or of a file in the scene's folder; it moves at ``speed_mm_s`` at most.
 
@@ -160,7 +164,7 @@ class Transducer(Section):
     """
 
     probe: str = "linear"
-    size_mm: Annotated[tuple[Length, Length, Length], LIST] | None = None
+    size_mm: Annotated[tuple[ProbeLength, ProbeLength, ProbeLength], LIST] | None = None
     speed_mm_s: float = Field(150.0, gt=0, le=2000)
     compression_warning_mm: float = Field(8.0, gt=0, le=100)
 
@@ -328,7 +332,7 @@ def load_scene(path: Path) -> Scene:
     except (FileNotFoundError, NotADirectoryError):
         raise SceneError(f"{path}: no such scene file or patient's folder") from None
     except TextError as error:
-        raise SceneError(f"{path}: cannot be read as TOML ({error}); {EXPECTED}") from None
+        raise SceneError(f"{path}: cannot be read ({error}); {EXPECTED}") from None
     try:
         scene = Scene.model_validate(values)
     except ValidationError as error:

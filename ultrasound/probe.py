@@ -41,9 +41,8 @@ DOPPLER_SETTINGS = ("velocity_scale_cm_s", "wall_filter_cm_s", "colour_gain_perc
 FORMER_KEYS = {"PulseCycles": "BandwidthPercent", "FocalZoneMm": "FNumber"}
 
 Percent = Annotated[float, Field(ge=0, le=100)]
-# Of a probe that reaches a kidney; transabdominal ones are up to 100 mm.
-MOST_MM = 150.0
-Length = Annotated[float, Field(gt=0, le=MOST_MM)]
+# Of a housing or array: those of transabdominal probes are up to 100 mm.
+Length = Annotated[float, Field(gt=0, le=150)]
 # TOML has lists where Python has tuples.
 Lengths = Annotated[tuple[Length, Length, Length], Field(strict=False)]
 Range = Annotated[tuple[float, float], Field(strict=False)]
