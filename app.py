@@ -116,6 +116,19 @@ def cli() -> None:
     """
 
 
+def _open_streams() -> None:
+    """Let output go nowhere where it is closed, as in a service or a Windows program without a console.
+
+    A file that is opened later would get the number of a closed stream, and with it what libraries print.
+    """
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
+
+
 def _show_any_letter() -> None:
     """Let output show what its encoding lacks, or a path that is not UTF-8, as backslashes instead of an error."""
     for stream in (sys.stdout, sys.stderr):
@@ -143,6 +156,7 @@ def main(arguments: list[str]) -> int:
     if not arguments or (arguments[0].startswith("-") and arguments[0] not in ("-h", "--help", "--version")):
         arguments = ["rehearse", *arguments]
     try:
+        _open_streams()
         _show_any_letter()
         return cli.main(args=arguments, prog_name="app.py", standalone_mode=False, obj=read_probe) or 0
     except click.ClickException as error:

@@ -9,14 +9,32 @@ import zipfile
 import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
+from datetime import date, time
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
 
-# How what was found is written: as Python has it, but never a whole matrix or file.
-FOUND = reprlib.Repr()
+# The largest number that is written with its digits; Python refuses to write those of thousands.
+MOST_INT = 10**40
+
+
+class _Found(reprlib.Repr):
+    """How what was found is written: as Python has it, but never a whole matrix or file, and dates as TOML has them."""
+
+    def repr_date(self, value: date | time, level: int) -> str:
+        return str(value)
+
+    repr_datetime = repr_time = repr_date
+
+    def repr_int(self, value: int, level: int) -> str:
+        return super().repr_int(value, level) if abs(value) < MOST_INT else "a number with many digits"
+
+
+FOUND = _Found()
 FOUND.maxlist, FOUND.maxstring = 4, 80
+# What pydantic says where a table is expected names classes of Python.
+NO_TABLE = ("model_type", "model_attributes_type", "dataclass_type", "dict_type", "mapping_type")
 # Wrong keys of a file that a message names besides the first.
 MOST_NAMED = 4
 
@@ -93,7 +111,9 @@ def explained(
     places = [[str(part) for part in problem["loc"] if part not in tags] for problem in problems]
     where, names = places[0], [".".join(place) for place in places]
     name, message = names[0], first["msg"][0].lower() + first["msg"][1:]
-    if first["type"] == "value_error":
+    if first["type"] in NO_TABLE:
+        message = "expected a table of keys and values"
+    elif first["type"] == "value_error":
         message = str(first["ctx"]["error"])
     if first["type"] == "extra_forbidden":
         text = f"{name}: {unknown(where)}"
@@ -104,7 +124,7 @@ def explained(
     elif isinstance(first["input"], dict):
         text = message if message.startswith(name) else f"{name}: {message}"
     else:
-        text = f"{name} = {FOUND.repr(first['input'])}: {message}"
+        text = f"{f'{name} = ' if name else ''}{FOUND.repr(first['input'])}: {message}"
     more = list(dict.fromkeys(each for each in names if each != name))
     others = ", ".join(more[:MOST_NAMED]) + (", ..." if len(more) > MOST_NAMED else "")
     return text + (f" (and {len(more)} more: {others})" if more else "")

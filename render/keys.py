@@ -2,7 +2,6 @@
 
 import re
 import string
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from errors import UserError, explained, meant
 from render.viewer import TECHNIQUES, Controls
-from text_files import read_text
+from text_files import TextError, read_toml
 from ultrasound.probe import DETAIL_LEVELS, DOPPLER_MODES, MODES
 from ultrasound.target import TARGETS
 
@@ -175,11 +174,11 @@ class Keys:
 def load_keys(path: Path) -> Keys:
     """Return the keys of a TOML file, with defaults for those it leaves out. Raises KeysError."""
     try:
-        given = _File.model_validate(tomllib.loads(read_text(path)))
-    except FileNotFoundError:
+        given = _File.model_validate(read_toml(path))
+    except (FileNotFoundError, NotADirectoryError):
         raise KeysError(f"{path}: no such key file; app.py keys prints one to start from") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise KeysError(f"{path}: cannot be read as a TOML key file ({str(error).splitlines()[0]})") from None
+    except TextError as error:
+        raise KeysError(f"{path}: cannot be read as a TOML key file ({error})") from None
     except ValidationError as error:
         raise KeysError(f"{path}: {explained(error, lambda _: SECTIONS)}") from None
     try:

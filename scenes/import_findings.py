@@ -12,7 +12,7 @@ from scenes.patient_space import Space
 from scenes.scene import Scene, SceneError
 from scenes.section import Section, Vector3
 from scenes.terminal import shell_command
-from text_files import read_text
+from text_files import TextError, read_text
 
 FINDINGS_FILE = "import.json"
 
@@ -94,8 +94,8 @@ def read_findings(folder: Path) -> ImportFindings | None:
         return ImportFindings.model_validate_json(read_text(path))
     except FileNotFoundError:
         return None
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read ({error.strerror}); check that it can be read") from None
+    except (NotADirectoryError, TextError) as error:
+        raise SceneError(f"{path}: cannot be read ({error}); check that it can be read") from None
     except ValidationError as error:
         raise SceneError(
             f"{path}: {explained(error)}; expected the findings of app.py import; import the patient again, or remove this file and its "

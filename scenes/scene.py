@@ -5,7 +5,6 @@ other than the schema's, and values out of range, and names each.
 """
 
 import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,7 +15,7 @@ from pydantic import AliasChoices, Field, ValidationError, model_validator
 from errors import UserError, explained, meant
 from scenes.section import LIST, Direction, Length, Section, Vector3
 from scenes.tissue import TISSUES, NeoHookeanTissue, Tissue
-from text_files import read_text
+from text_files import TextError, read_toml
 from version import FORMAT, of_this_format
 
 # The scene of the embedded patient.
@@ -153,6 +152,10 @@ class DistanceShape(Section):
 Shape = Annotated[PlaneShape | MeshShape | DistanceShape, Field(discriminator="kind")]
 
 
+# Of a probe's housing, as in its file.
+ProbeLength = Annotated[float, Field(gt=0, le=150)]
+
+
 class Transducer(Section):
     """A probe: the name of one in ``ultrasound/probes``, or of a file in the scene's folder; it moves at ``speed_mm_s`` at most.
 
@@ -161,7 +164,7 @@ class Transducer(Section):
     """
 
     probe: str = "linear"
-    size_mm: Annotated[tuple[Length, Length, Length], LIST] | None = None
+    size_mm: Annotated[tuple[ProbeLength, ProbeLength, ProbeLength], LIST] | None = None
     speed_mm_s: float = Field(150.0, gt=0, le=2000)
     compression_warning_mm: float = Field(8.0, gt=0, le=100)
 
@@ -302,7 +305,7 @@ NOT_SCENES: dict[str | tuple[str, ...], str] = {
     ".xml": "a PLUS configuration: give it to reconstruct --config",
     (".png", ".webp", ".jpg", ".jpeg"): "a picture",
 }
-EXPECTED = "expected a scene file (TOML) or a patient's folder"
+EXPECTED = "expected a scene file (TOML in UTF-8) or a patient's folder"
 
 
 def scene_file(named: Path) -> Path:
@@ -325,15 +328,11 @@ def load_scene(path: Path) -> Scene:
         if path.name.lower().endswith(ends) and path.is_file():
             raise SceneError(f"{path}: is {what}; {EXPECTED}")
     try:
-        values = tomllib.loads(read_text(path))
-    except FileNotFoundError:
+        values = read_toml(path)
+    except (FileNotFoundError, NotADirectoryError):
         raise SceneError(f"{path}: no such scene file or patient's folder") from None
-    except UnicodeDecodeError:
-        raise SceneError(f"{path}: is not text in UTF-8; {EXPECTED}; save it as UTF-8") from None
-    except (OSError, tomllib.TOMLDecodeError) as error:
-        raise SceneError(
-            f"{path}: cannot be read as TOML ({str(error).splitlines()[0]}); {EXPECTED}"
-        ) from None
+    except TextError as error:
+        raise SceneError(f"{path}: cannot be read ({error}); {EXPECTED}") from None
     try:
         scene = Scene.model_validate(values)
     except ValidationError as error:

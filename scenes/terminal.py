@@ -1,5 +1,6 @@
 """Terminal output: progress bars, the current step of a long task, command lines to paste."""
 
+import re
 import shlex
 import subprocess
 import sys
@@ -16,6 +17,8 @@ Progress = Callable[[Iterable[Any], str], Iterable[Any]]
 # Called with a message when the next step of a task begins.
 ReportProgress = Callable[[str], None]
 REFRESH_S = 0.5
+# How Python has a byte of a path that is not UTF-8.
+NOT_UTF_8 = re.compile("[\udc80-\udcff]")
 
 
 def silent(things: Iterable[Any], title: str) -> Iterable[Any]:
@@ -54,4 +57,9 @@ def stages() -> Iterator[ReportProgress]:
 def shell_command(*words: str | PurePath) -> str:
     """A command line of app.py with these words, quoted for this system's shell."""
     line = ["python", "app.py", *map(str, words)]
-    return subprocess.list2cmdline(line) if sys.platform == "win32" else shlex.join(line)
+    return subprocess.list2cmdline(line) if sys.platform == "win32" else " ".join(map(_quoted, line))
+
+
+def _quoted(word: str) -> str:
+    """A word for a POSIX shell; bytes that are not UTF-8 become $'\\xe9', which bash and zsh read."""
+    return NOT_UTF_8.sub(lambda byte: f"'$'\\x{ord(byte[0]) - 0xDC00:02x}''", shlex.quote(word))

@@ -1,22 +1,26 @@
 """Tables of numbers in CSV files, which studies read."""
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from errors import UserError
-from text_files import read_text, table_rows
+from errors import FOUND, UserError
+from text_files import TextError, read_text, table_rows
 
 
-def read_numbers(path: Path, columns: Sequence[str], error_type: type[UserError]) -> np.ndarray:
-    """Values (rows, columns) of the named columns. Raises ``error_type`` for a file, a column or a value that is not valid."""
+def read_numbers(
+    path: Path, columns: Sequence[str], error_type: type[UserError]
+) -> tuple[np.ndarray, list[int]]:
+    """Values (rows, columns) of the named columns, and the rows' lines in the file (rows,). Raises ``error_type`` for a file, a column or a value that is not valid."""
     try:
-        heads, *lines = table_rows(read_text(path)) or [[]]
-        rows = [dict(zip(heads, line, strict=False)) for line in lines]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        table = table_rows(read_text(path))
+    except (FileNotFoundError, NotADirectoryError):
+        raise error_type(f"{path}: no such file; expected a table in CSV") from None
+    except TextError as error:
         raise error_type(f"{path}: cannot be read ({error}); expected a table in CSV") from None
+    heads, *cells = table.values() or [[]]
+    rows, lines = [dict(zip(heads, row, strict=False)) for row in cells], list(table)[1:]
     if not rows:
         raise error_type(f"{path}: has no rows; expected a header and one line a row")
     missing = [name for name in columns if name not in heads]
@@ -28,8 +32,9 @@ def read_numbers(path: Path, columns: Sequence[str], error_type: type[UserError]
     numbers = np.array(values)
     for row, column in np.argwhere(~np.isfinite(numbers)):
         text = rows[row].get(columns[column])
-        raise error_type(f"{path}: line {row + 2}, {columns[column]} is {text!r}: expected a finite number")
-    return numbers
+        what = "missing" if text is None else FOUND.repr(text)
+        raise error_type(f"{path}: line {lines[row]}, {columns[column]} is {what}: expected a finite number")
+    return numbers, lines
 
 
 def _number(text: str | None) -> float:

@@ -409,3 +409,15 @@ def test_a_real_kidney_comes_in_and_gives_way(data, tmp_path, monkeypatch, capsy
         for path in sorted((tmp_path / "out" / "slices").glob("*.png"))
     ]
     assert np.abs(slices[0] - slices[-1]).mean() > 5
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a shell of POSIX")
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_no_file_gets_the_number_of_a_closed_stream(tmp_path, closed):
+    """What a library prints would be written into that file."""
+    script = "import app, sys; app.main(['--version']); print(open(sys.argv[1], 'w').fileno(), file=open(sys.argv[2], 'w'))"
+    names = [str(tmp_path / "first"), str(tmp_path / "number")]
+    subprocess.run(
+        ["sh", "-c", f'exec "$@" {closed}', "sh", sys.executable, "-c", script, *names], cwd=ROOT, check=True
+    )
+    assert int((tmp_path / "number").read_text()) > 2

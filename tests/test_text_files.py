@@ -1,6 +1,5 @@
 """Text and tables as editors and spreadsheets save them."""
 
-import csv
 import json
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from rehearsal.tracking.pose_file import PoseError, load_poses, load_timed_poses
 from render.keys import Keys, keys_text, load_keys
 from scenes.scene import EMBEDDED, SceneError, load_scene
 from studies.number_table import read_numbers
-from text_files import read_text, table_rows
+from text_files import TextError, json_value, read_json, read_text, read_toml, table_rows
 from ultrasound.probe import load_probe
 
 ENCODINGS = ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"]
@@ -46,10 +45,10 @@ def test_so_are_scenes_probes_keys_plans_and_poses(tmp_path, encoding):
 @pytest.mark.parametrize("content", [b"title = 'K\xf6ln'\n[anatomy]\n", b"\xff\xfe\x00\xd8\x00\xd8"])
 def test_another_encoding_is_named_with_its_remedy(tmp_path, content):
     (tmp_path / "scene.toml").write_bytes(content)
-    with pytest.raises(SceneError, match="is not text in UTF-8; .*save it as UTF-8"):
+    with pytest.raises(SceneError, match="not text in UTF-8.; expected a scene file .TOML in UTF-8"):
         load_scene(tmp_path / "scene.toml")
     (tmp_path / "poses.csv").write_bytes(content)
-    with pytest.raises(PoseError, match="is not text"):
+    with pytest.raises(PoseError, match="not text in UTF-8"):
         load_poses(tmp_path / "poses.csv")
 
 
@@ -69,8 +68,9 @@ def test_poses_and_tables_of_numbers_are_read_from_spreadsheets(tmp_path, encodi
     table = "\n".join(
         [separator.join(["id", "x", "y"]), separator.join(["1", f"0{point}5", f"-1{point}25e1"]), ""]
     )
-    numbers = read_numbers(saved(tmp_path / "beads.csv", table, encoding), ["x", "y"], UserError)
+    numbers, lines = read_numbers(saved(tmp_path / "beads.csv", table, encoding), ["x", "y"], UserError)
     np.testing.assert_allclose(numbers, [[0.5, -12.5]])
+    assert lines == [2]
 
 
 @pytest.mark.parametrize("lines", [["0,5,1,0"], ["1,0"] * 2])
@@ -80,10 +80,51 @@ def test_decimal_commas_between_commas_are_refused_with_the_remedy(tmp_path, lin
         load_poses(path)
 
 
-def test_the_separator_that_excel_states_is_no_row():
-    assert table_rows("sep=;\na;b\n1,5;x,y\n") == [["a", "b"], ["1.5", "x,y"]]
-    with pytest.raises(csv.Error):
+@pytest.mark.parametrize("stated", ["sep=;", "SEP=;", '"sep=;"'])
+def test_what_excel_leaves_around_a_table_is_no_row(stated):
+    table = f"{stated}\n\na;b;;\n;;;\n1,5;x,y;;\n# a comment;;\n;2;;\n"
+    assert table_rows(table) == {3: ["a", "b"], 5: ["1.5", "x,y"], 7: ["", "2"]}
+    assert table_rows(";;\n") == table_rows("") == {}
+
+
+def test_a_cell_without_end_is_refused_in_words():
+    with pytest.raises(TextError, match="not valid CSV"):
         table_rows("a," + "b" * 200_000)
+
+
+@pytest.mark.parametrize("cell", ["1.200", "-12.345.678"])
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_a_point_that_may_be_of_thousands_is_refused_among_decimal_commas(cell, separator):
+    with pytest.raises(TextError, match=f"line 2: {cell} may be thousands"):
+        table_rows(f"0,5{separator}1\n{cell}{separator}2\n")
+    assert table_rows(f"0.5{separator}1\n{cell}{separator}2\n")[2] == [cell, "2"]
+    assert table_rows(f"0,5{separator}0.125{separator}1.25\n") == {1: ["0.5", "0.125", "1.25"]}
+
+
+@pytest.mark.parametrize(
+    ("read", "text", "words"),
+    [
+        (read_json, "[" * 100_000, "^not valid JSON: nested too deeply$"),
+        (read_json, "[" + "9" * 5000 + "]", "^not valid JSON: a number with thousands of digits$"),
+        (read_json, '{\n "a": }', "^not valid JSON at line 2, column 7$"),
+        (read_toml, "a = " + "[" * 100_000, "^not valid TOML: nested too deeply$"),
+        (read_toml, "a = " + "9" * 5000, "^not valid TOML: a number with thousands of digits$"),
+        (read_toml, "a = 1\nb\n", "^not valid TOML: .*line 2"),
+    ],
+)
+def test_damaged_json_and_toml_are_refused_in_words(tmp_path, read, text, words):
+    (tmp_path / "a").write_text(text)
+    with pytest.raises(TextError, match=words):
+        read(tmp_path / "a")
+
+
+def test_what_is_no_text_is_refused_in_words(tmp_path):
+    with pytest.raises(TextError, match="^is a directory$|^permission denied$"):
+        read_text(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        read_toml(tmp_path / "none")
+    with pytest.raises(TextError, match="^not text in UTF-8$"):
+        json_value(b'"\xe9"')
 
 
 @pytest.mark.parametrize(

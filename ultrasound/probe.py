@@ -4,7 +4,6 @@ A probe file is TOML with PLUS's names (TransducerGeometry, DepthMm, FrequencyMh
 plane are (u, v) [mm]: u to the marked side, v down into the tissue, the origin at the centre of the array face.
 """
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -14,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic.alias_generators import to_pascal
 
 from errors import UserError, explained, meant
-from text_files import read_text
+from text_files import TextError, read_toml
 from ultrasound.pulse import DB_OF_NEPER, PATH_STEP, SOUND_MM_US, AttenuatedPulse, attenuated_pulse
 
 PROBES = Path(__file__).parent / "probes"
@@ -42,7 +41,8 @@ DOPPLER_SETTINGS = ("velocity_scale_cm_s", "wall_filter_cm_s", "colour_gain_perc
 FORMER_KEYS = {"PulseCycles": "BandwidthPercent", "FocalZoneMm": "FNumber"}
 
 Percent = Annotated[float, Field(ge=0, le=100)]
-Length = Annotated[float, Field(gt=0)]
+# Of a housing or array: those of transabdominal probes are up to 100 mm.
+Length = Annotated[float, Field(gt=0, le=150)]
 # TOML has lists where Python has tuples.
 Lengths = Annotated[tuple[Length, Length, Length], Field(strict=False)]
 Range = Annotated[tuple[float, float], Field(strict=False)]
@@ -80,7 +80,7 @@ class Probe(BaseModel):
     transducer_geometry: Literal["LINEAR", "CURVILINEAR", "PHASED"] = "LINEAR"
     housing_mm: Lengths = (40.0, 10.0, 20.0)
     edge_radius_mm: float = Field(0.0, ge=0, le=20)
-    transducer_width_mm: float = Field(40.0, gt=0, le=300)
+    transducer_width_mm: Length = 40.0
     radius_start_mm: float = Field(0.0, ge=0, le=300)
     theta_start_deg: float = Field(0.0, ge=-80, le=0)
     theta_stop_deg: float = Field(0.0, ge=0, le=80)
@@ -299,12 +299,14 @@ def load_probe(name: str) -> Probe:
     built_in = PROBES / f"{name}.toml"
     path = built_in if built_in.is_file() else Path(name)
     try:
-        return probe_of_values(tomllib.loads(read_text(path)))
-    except FileNotFoundError:
+        return probe_of_values(read_toml(path))
+    except (FileNotFoundError, NotADirectoryError):
         known = ", ".join(sorted(each.stem for each in PROBES.glob("*.toml")))
         raise ProbeError(f"transducer.probe: {name!r} is no file, and known by name are {known}") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ProbeError(f"{path}: cannot be read as a probe file ({str(error).splitlines()[0]})") from None
+    except TextError as error:
+        raise ProbeError(
+            f"{path}: cannot be read as a probe file ({error}); expected TOML in UTF-8"
+        ) from None
     except ProbeError as error:
         raise ProbeError(f"{path}: {error}") from None
 

@@ -1,6 +1,5 @@
 """The bands of ``study uncertainty`` for the panel: how far a measurement may differ, because the patient's tissue is not known."""
 
-import json
 from pathlib import Path
 from typing import Literal
 
@@ -8,7 +7,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from errors import UserError, explained
-from text_files import read_text
+from text_files import TextError, read_json
 
 
 class UncertaintyError(UserError):
@@ -60,12 +59,12 @@ def read_bands(path: Path) -> UncertaintyBands:
     """Read uncertainty.json. Raises UncertaintyError that names the file and what to do."""
     again = "make it with: app.py study uncertainty"
     try:
-        return UncertaintyBands.model_validate(json.loads(read_text(path)))
-    except FileNotFoundError:
+        return UncertaintyBands.model_validate(read_json(path))
+    except (FileNotFoundError, NotADirectoryError):
         raise UncertaintyError(
             f"{path}: no such file, which the scene names as uncertainty; {again}"
         ) from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except TextError as error:
         raise UncertaintyError(f"{path}: cannot be read as JSON ({error}); {again}") from None
     except ValidationError as error:
         raise UncertaintyError(f"{path}: {explained(error)}; {again}") from None

@@ -23,7 +23,7 @@ from rehearsal.result_files import next_number
 from rehearsal.tracking.pose_file import Pose, TimedPoses
 from scenes.atomic_files import atomic_write
 from scenes.scene import Trocar
-from text_files import read_text
+from text_files import TextError, read_text
 from ultrasound.target import Target
 from version import FORMAT, of_this_format
 
@@ -129,7 +129,7 @@ def is_plan(path: Path) -> bool:
     """Whether a file begins as a plan does."""
     try:
         return MARK in read_text(path)[:100]
-    except (OSError, UnicodeDecodeError):
+    except (OSError, TextError):
         return False
 
 
@@ -137,14 +137,15 @@ def read_plan(path: Path) -> Plan:
     """Read a plan. Raises PlanError."""
     try:
         return Plan.model_validate_json(read_text(path))
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise PlanError(f"{path}: no such plan; make one with: app.py plan SCENE --out {path.name}") from None
-    except OSError as error:
-        raise PlanError(f"{path}: cannot be read as a plan ({error.strerror})") from None
-    except (ValidationError, UnicodeDecodeError) as error:
-        what = explained(error) if isinstance(error, ValidationError) else "invalid JSON"
+    except TextError as error:
         raise PlanError(
-            f"{path}: not a plan of this version ({what}); expected a file that app.py plan wrote"
+            f"{path}: cannot be read as a plan ({error}); expected a file that app.py plan wrote"
+        ) from None
+    except ValidationError as error:
+        raise PlanError(
+            f"{path}: not a plan of this version ({explained(error)}); expected a file that app.py plan wrote"
         ) from None
 
 

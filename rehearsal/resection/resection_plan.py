@@ -21,7 +21,7 @@ from rehearsal.resection.proposal import Proposal, cost_ml
 from rehearsal.resection.script import Number
 from render.viewer import Technique
 from scenes.atomic_files import atomic_write
-from text_files import read_text
+from text_files import TextError, read_text
 from version import FORMAT, of_this_format
 
 # The first bytes of a plan contain this.
@@ -138,7 +138,7 @@ def is_resection_plan(path: Path) -> bool:
     """Whether a file begins as a plan of a resection does."""
     try:
         return MARK in read_text(path)[:100]
-    except (OSError, UnicodeDecodeError):
+    except (OSError, TextError):
         return False
 
 
@@ -146,12 +146,11 @@ def read_resection_plan(path: Path) -> ResectionPlan:
     """Read a plan. Raises ResectionPlanError."""
     try:
         return ResectionPlan.model_validate_json(read_text(path))
-    except OSError as error:
+    except (FileNotFoundError, NotADirectoryError):
+        raise ResectionPlanError(f"{path}: no such plan of a resection") from None
+    except TextError as error:
+        raise ResectionPlanError(f"{path}: cannot be read as a plan of a resection ({error})") from None
+    except ValidationError as error:
         raise ResectionPlanError(
-            f"{path}: cannot be read as a plan of a resection ({error.strerror})"
-        ) from None
-    except (ValidationError, UnicodeDecodeError) as error:
-        what = explained(error) if isinstance(error, ValidationError) else "invalid JSON"
-        raise ResectionPlanError(
-            f"{path}: not a plan of a resection of this version ({what}); expected a file that app.py plan --resect wrote"
+            f"{path}: not a plan of a resection of this version ({explained(error)}); expected a file that app.py plan --resect wrote"
         ) from None

@@ -4,7 +4,6 @@ The first line names what is rehearsed; each other line is a second: events, the
 it. Once a minute and at the end a line has the whole state and the coverage; the last line has the summary. No line names a patient or a path.
 """
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -25,6 +24,7 @@ from rehearsal.sessions.packed_arrays import (
 )
 from render.viewer import Technique
 from scenes.scene import Scene
+from text_files import TextError, json_value
 from ultrasound.crater import Filling
 from version import FORMAT, of_this_format
 
@@ -175,7 +175,7 @@ def read_log(path: Path) -> Log:
     except FileNotFoundError:
         raise SessionError(f"{path}: no such session file") from None
     except OSError as error:
-        raise SessionError(f"{name}: cannot be read as a session ({str(error).splitlines()[0]})") from None
+        raise SessionError(f"{name}: cannot be read as a session ({error.strerror})") from None
     header = _header(name, lines[0])
     log = Log(header, np.zeros((0, 4, 4)), np.zeros(0))
     parts: list[np.ndarray] = []
@@ -238,9 +238,9 @@ def _lengths_of(second: Second, steps: int, usual_s: float) -> np.ndarray:
 
 def _header(name: str, line: bytes) -> Header:
     try:
-        return Header.model_validate(json.loads(line))
-    except (ValueError, RecursionError) as error:
-        what = explained(error) if isinstance(error, ValidationError) else "invalid JSON"
+        return Header.model_validate(json_value(line))
+    except (ValidationError, TextError) as error:
+        what = explained(error) if isinstance(error, ValidationError) else error
         raise SessionError(
             f"{name}: not a session of this version ({what}); expected a file that rehearse has written, such as session-001.jsonl"
         ) from None
@@ -248,13 +248,11 @@ def _header(name: str, line: bytes) -> Header:
 
 def _line_of(name: str, number: int, line: bytes) -> Second | End:
     try:
-        values = json.loads(line)
-        return End.model_validate(values) if "summary" in values else Second.model_validate(values)
-    except (ValueError, TypeError, RecursionError) as error:
-        what = str(error)
-        if isinstance(error, ValidationError):
-            first = error.errors()[0]
-            what = str(first.get("ctx", {}).get("error", first["msg"]))
+        values = json_value(line)
+        is_end = isinstance(values, dict) and "summary" in values
+        return End.model_validate(values) if is_end else Second.model_validate(values)
+    except (ValidationError, TextError) as error:
+        what = explained(error) if isinstance(error, ValidationError) else error
         raise SessionError(
             f"{name}: line {number} is damaged ({what}); what comes before it can be had by deleting from it on"
         ) from None

@@ -1,17 +1,16 @@
 """Files of probe poses: for the images of ``scan``, and as a path that a rehearsal follows."""
 
-import csv
-import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from errors import UserError
+from errors import UserError, explained
 from rehearsal.resection.script import Number, ScriptedAction, ScriptedCut
-from text_files import read_text, table_rows
+from text_files import TABLES, TextError, json_value, read_text, table_rows
 from ultrasound.probe_manipulator import interpolated
 
 # Tolerance of orthonormal axes: more than the rounding of six digits in a file or of a float32, less than a scaled matrix.
@@ -51,6 +50,12 @@ def _rigid(rows: list[list[float]]) -> list[list[float]]:
     return rows
 
 
+def _possible_name(name: str) -> str:
+    if not re.fullmatch("[A-Za-z0-9_-]{0,40}", name):
+        raise ValueError("expected at most 40 English letters, digits, - and _")
+    return name
+
+
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 Place = tuple[Number, Number, Number]
 Pose = Annotated[list[Row], Field(min_length=4, max_length=4), AfterValidator(_rigid)]
@@ -59,7 +64,7 @@ Pose = Annotated[list[Row], Field(min_length=4, max_length=4), AfterValidator(_r
 class _FilePose(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    name: str = Field("", max_length=40, pattern=r"^[A-Za-z0-9_-]*$")
+    name: Annotated[str, AfterValidator(_possible_name)] = ""
     time_s: float | None = None
     probe_to_patient: Pose
     score: Literal["image"] | Annotated[list[Place], Field(min_length=1)] | None = None
@@ -153,41 +158,36 @@ def load_timed_poses(path: Path) -> TimedPoses:
 
 
 def _read(path: Path) -> list[_FilePose]:
+    is_table = path.suffix.lower() in TABLES
     try:
         text = read_text(path)
         if not text.strip():
             raise PoseError(f"{path}: is empty; expected a list of poses")
-        is_csv = path.suffix.lower() == ".csv"
-        values = _of_csv(path, text) if is_csv else json.loads(text)
-        # In JSON a text is no number.
-        found = TypeAdapter(list[_FilePose]).validate_python(values, strict=not is_csv)
-    except FileNotFoundError:
+        values = _of_table(path, table_rows(text)) if is_table else json_value(text)
+    except (FileNotFoundError, NotADirectoryError):
         raise PoseError(f"{path}: no such pose file") from None
-    except UnicodeDecodeError:
-        raise PoseError(f"{path}: is not text; {EXPECTED}") from None
-    except csv.Error as error:
-        raise PoseError(f"{path}: not valid CSV: {error}; {EXPECTED}") from None
-    except OSError as error:
-        raise PoseError(f"{path}: cannot be read as poses ({error.strerror})") from None
-    except json.JSONDecodeError as error:
-        raise PoseError(f"{path}: not valid JSON: {error}; {EXPECTED}") from None
-    except ValidationError as error:
-        first, where = error.errors(include_url=False)[0], ""
-        if first["loc"]:
-            number, *field = first["loc"]
-            where = f"pose {int(number) + 1}, {'.'.join(map(str, field))}: "
-        found_wrong = str(first.get("ctx", {}).get("error", first["msg"].lower()))
-        raise PoseError(
-            f"{path}: {where}{found_wrong}; expected a list of poses with probe_to_patient, 4 rows of 4 numbers"
-        ) from None
-    if not found:
+    except TextError as error:
+        raise PoseError(f"{path}: cannot be read as poses ({error}); {EXPECTED}") from None
+    if not isinstance(values, list):
+        raise PoseError(f"{path}: is no list; expected a list of poses, each with probe_to_patient")
+    if not values:
         raise PoseError(f"{path}: holds no poses; expected at least one")
-    return found
+    # In JSON a text is no number.
+    return [_pose(path, number, pose, strict=not is_table) for number, pose in enumerate(values, 1)]
 
 
-def _of_csv(path: Path, text: str) -> list[dict[str, Any]]:
+def _pose(path: Path, number: int, values: Any, strict: bool) -> _FilePose:
+    try:
+        return _FilePose.model_validate(values, strict=strict)
+    except ValidationError as error:
+        raise PoseError(
+            f"{path}: pose {number}, {explained(error)}; expected a list of poses with probe_to_patient, 4 rows of 4 numbers"
+        ) from None
+
+
+def _of_table(path: Path, table: dict[int, list[str]]) -> list[dict[str, Any]]:
     """The poses as JSON has them, their numbers as text."""
-    rows = table_rows(text)
+    rows = list(table.values())
     for number, row in enumerate(rows, 1):
         if len(row) not in (16, 17) or len(row) != len(rows[0]):
             raise PoseError(

@@ -5,7 +5,6 @@ the frame of the organ's surface. Other keys are ignored.
 """
 
 import hashlib
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -21,7 +20,7 @@ from sim.attachment import FixedRegion
 from sim.material import Material, Part
 from sim.signed_distance import signed_distance
 from studies.number_table import read_numbers
-from text_files import read_text
+from text_files import TextError, read_toml
 
 # The paper's, where a case has none.
 DENSITY_KG_M3 = 1050.0
@@ -219,8 +218,8 @@ def load_case(folder: Path) -> BeadCase:
     file = _read_file(folder)
     probe, material, files = file.probe, file.material, file.files
     organ, support = _surface(folder, files.kidney), _surface(folder, files.support)
-    beads, measured = _read_beads(folder / files.beads, len(file.stage))
-    _check_beads(folder / files.beads, beads, measured, organ)
+    beads, measured, lines = _read_beads(folder / files.beads, len(file.stage))
+    _check_beads(folder / files.beads, beads, measured, lines, organ)
     poses = np.tile(np.eye(4), (len(file.stage), 1, 1))
     poses[:, :3, :3] = [stage.rotation or probe.rotation for stage in file.stage]
     poses[:, :3, 3] = [stage.position for stage in file.stage]
@@ -259,14 +258,12 @@ def _part(folder: Path, part: CasePart) -> Part:
 def _read_file(folder: Path) -> CaseFile:
     path = folder / "case.toml"
     try:
-        return CaseFile.model_validate(tomllib.loads(read_text(path)))
+        return CaseFile.model_validate(read_toml(path))
     except (FileNotFoundError, NotADirectoryError):
         raise CaseError(
             f"{folder}: holds no case.toml; name a folder with case.toml, two STL surfaces and beads.csv"
         ) from None
-    except tomllib.TOMLDecodeError as error:
-        raise CaseError(f"{path}: not valid TOML: {error}; correct it there") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except TextError as error:
         raise CaseError(f"{path}: cannot be read ({error}); expected TOML in UTF-8") from None
     except ValidationError as error:
         raise CaseError(f"{path}: {explained(error)}; correct it there") from None
@@ -279,26 +276,28 @@ def _surface(folder: Path, name: str) -> trimesh.Trimesh:
         raise CaseError(str(error)) from None
 
 
-def _read_beads(path: Path, stages: int) -> tuple[np.ndarray, np.ndarray]:
-    """Positions of the beads (n, 3) stress-free and (stages, n, 3) measured [mm]."""
+def _read_beads(path: Path, stages: int) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """Positions of the beads (n, 3) stress-free and (stages, n, 3) measured [mm], and their lines in the file (n,)."""
     columns = [f"{axis}{stage}" for stage in ("", *range(stages)) for axis in "xyz"]
-    values = read_numbers(path, columns, CaseError)
+    values, lines = read_numbers(path, columns, CaseError)
     positions = values.reshape(len(values), stages + 1, 3).transpose(1, 0, 2)
-    return positions[0].copy(), positions[1:].copy()
+    return positions[0].copy(), positions[1:].copy(), lines
 
 
-def _check_beads(path: Path, beads: np.ndarray, measured: np.ndarray, organ: trimesh.Trimesh) -> None:
+def _check_beads(
+    path: Path, beads: np.ndarray, measured: np.ndarray, lines: list[int], organ: trimesh.Trimesh
+) -> None:
     outside = signed_distance(organ.vertices, organ.faces, beads)[0]
     if outside.max() > 0:
         raise CaseError(
-            f"{path}: the bead on line {2 + outside.argmax()} is {outside.max():.2f} mm outside the organ at x, y, z: "
+            f"{path}: the bead on line {lines[outside.argmax()]} is {outside.max():.2f} mm outside the organ at x, y, z: "
             f"expected a place inside, in mm in the organ's frame"
         )
     moved = np.linalg.norm(measured - beads, axis=2)
     stage, bead = np.unravel_index(moved.argmax(), moved.shape)
     if moved.max() > organ.extents.max():
         raise CaseError(
-            f"{path}: the bead on line {2 + bead} is {moved.max():.0f} mm from its stress-free place at stage {stage}: "
+            f"{path}: the bead on line {lines[bead]} is {moved.max():.0f} mm from its stress-free place at stage {stage}: "
             f"expected less than the organ's length, in mm in the organ's frame"
         )
 

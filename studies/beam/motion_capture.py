@@ -78,7 +78,7 @@ def read_capture(path: Path) -> Capture:
     load = re.search(r"load(\d+)", path.stem)
     if load is None and "gravity" not in path.stem:
         raise BeamError(f"{path}: its name has neither 'gravity' nor 'load' and grams, such as load52")
-    table = read_numbers(path, COLUMNS, BeamError)
+    table, _ = read_numbers(path, COLUMNS, BeamError)
     if len(table) < HELD_FRAMES + REST_FRAMES:
         raise BeamError(
             f"{path}: {len(table)} frames are too few; expected {HELD_FRAMES + REST_FRAMES} at least"

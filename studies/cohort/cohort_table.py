@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from errors import UserError, explained
 from rehearsal.result_files import write_json
 from studies.study_results import table_of
-from text_files import read_text
+from text_files import TextError, read_text
 
 FILE = "cohort.json"
 
@@ -90,7 +90,7 @@ def read_rows(folder: Path) -> list[PatientRow]:
         return CohortFile.model_validate_json(read_text(path)).patients
     except FileNotFoundError:
         return []
-    except (OSError, UnicodeDecodeError) as error:
+    except (NotADirectoryError, TextError) as error:
         raise CohortError(f"{path}: cannot be read ({error}); choose another --out") from None
     except ValidationError as error:
         raise CohortError(

@@ -144,7 +144,7 @@ def test_a_turned_pose_is_taken_and_no_file_or_a_folder_refused(tmp_path):
     with pytest.raises(PlanError, match="no such plan; make one with: app.py plan SCENE --out none.json"):
         read_plan(tmp_path / "none.json")
     (tmp_path / "a.png").write_bytes(b"\x89PNG")
-    with pytest.raises(PlanError, match=r"invalid JSON\); expected a file that app.py plan wrote"):
+    with pytest.raises(PlanError, match=r"not text in UTF-8\); expected a file that app.py plan wrote"):
         read_plan(tmp_path / "a.png")
     with pytest.raises(PlanError, match="cannot be read as a plan"):
         read_plan(tmp_path)

@@ -73,7 +73,7 @@ def test_poses_of_both_formats_are_the_same(tmp_path):
         ('[{"matrix": []}]', "pose 1"),
         (
             json.dumps([dict(probe_to_patient=np.diag([1.0, 1, 2, 1]).tolist())]),
-            "pose 1, probe_to_patient: not rigid",
+            "[0.0, 0.0, 0.0, 1.0]]: not rigid",
         ),
         (json.dumps([dict(probe_to_patient=np.diag([1.0, 1, -1, 1]).tolist())]), "determinant -1"),
         (json.dumps([dict(name="a", probe_to_patient=np.eye(4).tolist())] * 2), "'a' occurs twice"),
@@ -88,9 +88,9 @@ def test_poses_that_cannot_be_used_are_refused_in_one_line(tmp_path, text, words
 def test_a_table_with_another_number_of_columns_is_refused(tmp_path):
     assert "pose 1: 3 numbers" in refused(tmp_path, "1,2,3", "poses.csv")
     letter = refused(tmp_path, ",".join(["1", "a", *"0" * 14]), "poses.csv")
-    assert "pose 1, probe_to_patient.0.1: input should be a valid number" in letter
+    assert "pose 1, probe_to_patient.0.1 = 'a': input should be a valid number" in letter
     (tmp_path / "a.png").write_bytes(b"\x89PNG")
-    with pytest.raises(PoseError, match="is not text; expected poses as JSON or CSV"):
+    with pytest.raises(PoseError, match="not text in UTF-8.; expected poses as JSON or CSV"):
         load_poses(tmp_path / "a.png")
     with pytest.raises(PoseError, match="cannot be read as poses"):
         load_poses(tmp_path)
@@ -121,7 +121,11 @@ def test_poses_with_times_of_both_formats_are_the_same(tmp_path):
         ("a.csv", "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1", "pose 1 has no time"),
         ("a.json", json.dumps([dict(probe_to_patient=np.eye(4).tolist())]), "pose 1 has no time"),
         ("a.json", json.dumps([dict(time_s="soon", probe_to_patient=np.eye(4).tolist())]), "pose 1, time_s"),
-        ("a.csv", "nan,1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1", "pose 1, time_s: input should be a finite number"),
+        (
+            "a.csv",
+            "nan,1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1",
+            "pose 1, time_s = 'nan': input should be a finite number",
+        ),
         ("a.csv", "0,1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1", "pose 2: 16 numbers"),
         ("a.csv", "5,1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n" * 2, "pose 2 at 5 s is not later"),
     ],

@@ -72,7 +72,12 @@ def refused(tmp_path: Path, text: str) -> str:
             "[anatomy]\n[tissue]\nmodel = 'mass-springs'",
             "tissue.model = 'mass-springs': the model should be one of",
         ),
-        ("tissue = 3\n[anatomy]", "tissue = 3: input should be a valid dictionary"),
+        (
+            "[anatomy]\n[transducer]\nsize_mm = [40.0, 10.0, 151.0]",
+            "transducer.size_mm.2 = 151.0: input should be less than or equal to 150",
+        ),
+        ("[anatomy]\n[tissue]\ncell_mm = 0x" + "f" * 5000, "tissue.cell_mm = a number with many digits"),
+        ("tissue = 3\n[anatomy]", "tissue = 3: expected a table of keys and values"),
         ("[anatomy]\n[tissue]\nmodel = [3]", "tissue.model = [3]: the model should be one of"),
         ("[anatomy]\n[contact]\nparticles = true", "needs particles: set tissue.model to shape-matching, or"),
         ("[anatomy]\n[gravity]\ndirection = [0, 0, 0]", "a direction must not be zero"),
@@ -111,7 +116,7 @@ def refused(tmp_path: Path, text: str) -> str:
         ),
         ("nephron_scene = 3\n[brain]\n", "nephron_scene = 3: written by Nephron 3, and this is Nephron 2"),
         ("nephron_scene = 'two'\n[anatomy]\n", "nephron_scene = 'two': expected 2"),
-        ("[anatomy\n", "; expected a scene file (TOML) or a patient's folder"),
+        ("[anatomy\n", "; expected a scene file (TOML in UTF-8) or a patient's folder"),
         ("[anatomy]\nphantom = true\nct = 'ct.nrrd'", "which has its own files"),
         ("[anatomy]\n[press]\nindentations_mm = [300.0]", "less than or equal to 40"),
     ],
@@ -124,7 +129,7 @@ def test_missing_and_unreadable_files_are_named(tmp_path):
     with pytest.raises(SceneError, match="no such scene file"):
         load_scene(tmp_path / "none.toml")
     (tmp_path / "b.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(SceneError, match="is not text in UTF-8; expected a scene file"):
+    with pytest.raises(SceneError, match="not text in UTF-8.; expected a scene file .TOML in UTF-8"):
         load_scene(tmp_path / "b.toml")
     with pytest.raises(SceneError, match="cannot be read"):
         load_scene(tmp_path)

@@ -129,7 +129,7 @@ def test_a_wrong_table_of_beads_is_refused(tmp_path, old, new, words):
 def test_a_short_line_is_refused(tmp_path):
     table = write_case(tmp_path) / "beads.csv"
     table.write_text(table.read_text().rstrip().rsplit(",", 1)[0])
-    assert "line 13, z2 is None" in refused(tmp_path)
+    assert "line 13, z2 is missing" in refused(tmp_path)
 
 
 def test_beads_elsewhere_are_refused(tmp_path):
@@ -138,7 +138,10 @@ def test_beads_elsewhere_are_refused(tmp_path):
     assert "the bead on line 6 is 2.0" in refused(write_case(tmp_path / "outside", places=places))
     places = beads()
     places[2, 5] *= 1000
-    assert "the bead on line 7 is" in refused(write_case(tmp_path / "metres", places=places))
+    folder = write_case(tmp_path / "metres", places=places)
+    assert "the bead on line 7 is" in refused(folder)
+    (folder / "beads.csv").write_text("# by hand\n\n" + (folder / "beads.csv").read_text())
+    assert "the bead on line 9 is" in refused(folder)
 
 
 def with_parts(tmp_path: Path) -> dict:

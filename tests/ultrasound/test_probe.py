@@ -97,6 +97,14 @@ WRONG = {
         GOOD + "HousingMm = [40.0, 0.0, 20.0]\n",
         "HousingMm.1 = 0.0: input should be greater than 0",
     ),
+    "a housing that passes through no skin": (
+        GOOD + "HousingMm = [40.0, 10.0, 151.0]\n",
+        "HousingMm.2 = 151.0: input should be less than or equal to 150",
+    ),
+    "a face as wide as a patient": (
+        GOOD + "HousingMm = [150.0, 10.0, 20.0]\nTransducerWidthMm = 160\n",
+        "TransducerWidthMm = 160: input should be less than or equal to 150",
+    ),
     "a sector of no angle": (GOOD + 'TransducerGeometry = "PHASED"\n', "ThetaStartDeg < 0 < ThetaStopDeg"),
     "a curve of no radius": (
         GOOD + 'TransducerGeometry = "CURVILINEAR"\nThetaStartDeg = -30.0\nThetaStopDeg = 30.0\n',
