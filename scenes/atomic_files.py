@@ -6,6 +6,7 @@ import re
 import secrets
 import shutil
 import tempfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,8 @@ from errors import PatientError
 
 # The process that writes a temporary file or folder, in its name.
 WRITER = re.compile(r"\.(\d+)-[0-9a-f]+\.partial-")
+# Letters of a name that a temporary name repeats whole: with the writer they stay below what file systems allow.
+SHORT = 24
 
 
 @contextmanager
@@ -49,7 +52,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
     The caller creates a folder itself; ``path`` must not exist, or be an empty folder. Raises OSError, which names the path.
     """
-    partial = path.with_name(f".{os.getpid()}-{secrets.token_hex(4)}.partial-{path.name}")
+    partial = path.with_name(f".{os.getpid()}-{secrets.token_hex(4)}.partial-{_short(path.name)}")
     try:
         yield partial
         if partial.is_dir() and path.exists():  # Windows does not replace a folder
@@ -64,11 +67,16 @@ def atomic_write(path: Path) -> Iterator[Path]:
             partial.unlink(missing_ok=True)
 
 
+def _short(name: str) -> str:
+    """A name, or a checksum and the end of a long one: the suffix, by which libraries choose a format, stays."""
+    return name if len(name) <= SHORT else f"{zlib.crc32(os.fsencode(name)):08x}{name[8 - SHORT :]}"
+
+
 @contextmanager
 def new_folder(folder: Path) -> Iterator[Path]:
     """Yield an empty folder to write to; it becomes ``folder`` when all files are written. Raises PatientError."""
     check_folder(folder)
-    for left in folder.parent.glob(f".*.partial-{glob.escape(folder.name)}"):
+    for left in folder.parent.glob(f".*.partial-{glob.escape(_short(folder.name))}"):
         if not _is_being_written(left):
             shutil.rmtree(left, ignore_errors=True)
     try:
@@ -88,13 +96,17 @@ def _is_being_written(partial: Path) -> bool:
 
 
 def check_folder(folder: Path) -> None:
-    """Check that a folder can be created, before the work. Raises PatientError."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    """Check that a folder of this name can be created and written to, before the work. Raises PatientError."""
+    # Path.exists raises where a name is too long.
+    if os.path.exists(folder) and (not folder.is_dir() or any(folder.iterdir())):
         raise PatientError(f"{folder}: exists and is not an empty folder; choose another folder or remove it")
-    # The files are written into a temporary folder beside it.
-    above = next(path for path in folder.absolute().parents if path.exists())
+    full = Path(os.path.abspath(folder))
+    above = next(path for path in full.parents if os.path.exists(path))
     try:
-        check_writable(above)
+        with tempfile.TemporaryDirectory(prefix=".", dir=above) as trial:
+            made = Path(trial, full.relative_to(above))
+            made.mkdir(parents=True)
+            check_writable(made)
     except OSError as error:
         raise PatientError(
             f"{folder}: cannot be made in {above} ({error.strerror}); choose a folder that can be written"

@@ -78,16 +78,16 @@ def test_the_command_that_is_printed_can_be_pasted():
 
 
 def test_a_folder_name_that_is_too_long_is_refused_before_the_work(volumes, tmp_path, monkeypatch, capsys):
-    """--out of 250 letters: the temporary folder's name is longer than a file's may be."""
+    """--out of 256 letters, which no file system has."""
     monkeypatch.setattr("scenes.patients.import_request.import_request", lambda *_: pytest.fail("worked"))
     refused(
-        capsys, "import", volumes / "ct.nii.gz", volumes / "labels.nii.gz", "--out", tmp_path / ("p" * 250)
+        capsys, "import", volumes / "ct.nii.gz", volumes / "labels.nii.gz", "--out", tmp_path / ("p" * 256)
     )
 
 
 def test_a_file_name_that_is_too_long_is_named_itself(tmp_path):
-    """plan --out with 250 letters: the error names that file, not the temporary one."""
-    path = tmp_path / ("p" * 245 + ".json")
+    """plan --out with 256 letters: the error names that file, not the temporary one."""
+    path = tmp_path / ("p" * 251 + ".json")
     with pytest.raises(OSError, match="too long") as caught, atomic_write(path) as partial:
         partial.write_text("{}")
     assert caught.value.filename == str(path)

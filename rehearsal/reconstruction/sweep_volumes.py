@@ -82,7 +82,7 @@ def reconstruct_volumes(
     ``labels`` are the same frames with ``PixelLabel`` values. ``places`` is called with the frames in order; without it the pixels are where
     the tracked poses place them. Without grey values there must be labels. ``progress`` shows the progress over frames and volumes.
 
-    Raises SweepError where labels and images do not match, ValueError as ``VoxelBox.around``.
+    Raises SweepError where labels and images do not match or the images are no volume, ValueError as ``VoxelBox.around``.
     """
     if labels is not None and labels.images.shape != sweep.images.shape:
         raise SweepError(
@@ -91,6 +91,7 @@ def reconstruct_volumes(
     if not mask.any():
         raise SweepError("all images are black: there is nothing to reconstruct")
     corners = corners_of(image_poses, mask)
+    _check_thickness(corners, spacing_mm)
     if places is not None:
         # Compressed tissue extends farther at rest.
         corners = np.concatenate([corners - reach_mm - 10.0, corners + reach_mm + 10.0])
@@ -118,6 +119,18 @@ def reconstruct_volumes(
     grey = volumes.pop(GREY)[0] if with_grey else np.zeros(box.shape, np.float32)
     regions = {name: values > HALF for name, (values, _) in volumes.items()}
     return SweepVolumes(box, grey, known, regions, beads.centroids)
+
+
+def _check_thickness(corners: np.ndarray, spacing_mm: float) -> None:
+    """Raises SweepError where corners (n, 3) [mm] are in one plane or line, within less than a voxel."""
+    centred = corners - corners.mean(axis=0)
+    across = np.linalg.svd(centred, full_matrices=False)[2][-1]
+    thickness = float(np.ptp(centred @ across))
+    if thickness < spacing_mm:
+        raise SweepError(
+            f"the images are in one plane: together they are {thickness:.2f} mm thick, less than a voxel of {spacing_mm:g} mm; expected two "
+            "images or more at different positions"
+        )
 
 
 def _channels(labels: Sweep | None) -> dict[str, Callable[[np.ndarray], np.ndarray] | None]:

@@ -17,8 +17,6 @@ from scenes.volumes.voxel_grid import Box, VoxelGrid, check_3d
 # Problems are reported as errors here.
 logging.getLogger("nibabel").setLevel(logging.CRITICAL)
 
-# How files begin: gzip's mark, and that of NIfTI, at a place.
-GZIP, NIFTI_MAGIC, MAGIC_AT, START_BYTES = b"\x1f\x8b", (b"n+1\0", b"ni1\0"), 344, 348
 SLAB_VOXELS = 8_000_000
 # A pattern, no XML parser: an extension may contain anything, and only the names are needed.
 LABEL_ENTRY = re.compile(r'<Label\s[^<>]*?Key="(\d{1,5})"[^<>]*>(?:<!\[CDATA\[)?([^<>\]]{1,200})')
@@ -33,7 +31,6 @@ def nifti_volume(path: Path, space: Space | None = None) -> LazyVolume:
 
     Raises PatientError: damaged, not 3D, sheared, no orientation.
     """
-    _check_kind(path)
     with parsing(f"{path}: cannot be read as NIfTI", "expected a whole file; copy or export it again"):
         image: Any = nibabel.load(path, keep_file_open=True)
         header, shape = image.header, image.shape
@@ -59,25 +56,6 @@ def nifti_volume(path: Path, space: Space | None = None) -> LazyVolume:
         return np.concatenate(planes)
 
     return LazyVolume(str(path), grid, read_box, space=assumed, metadata=_label_names(header))
-
-
-def _check_kind(path: Path) -> None:
-    """Raises PatientError where a file is compressed or not in another way than its name ends in, or is a web page."""
-    with path.open("rb") as file:
-        start = file.read(START_BYTES)
-    is_named_gzip = path.name.lower().endswith(".gz")
-    if start.lstrip()[:1] == b"<":
-        raise PatientError(f"{path}: is a web page or XML; expected NIfTI; download it again")
-    if start.startswith(GZIP) and not is_named_gzip:
-        raise PatientError(f"{path}: is compressed; expected NIfTI as it is; rename it to end in .nii.gz")
-    if is_named_gzip and start and not start.startswith(GZIP):
-        is_nifti = start[MAGIC_AT:] in NIFTI_MAGIC
-        found, advice = (
-            ("NIfTI that is not compressed", "rename it to end in .nii")
-            if is_nifti
-            else ("not compressed by gzip", "copy or export it again")
-        )
-        raise PatientError(f"{path}: is {found}; expected NIfTI compressed by gzip; {advice}")
 
 
 def _label_names(header: Any) -> dict[str, str]:

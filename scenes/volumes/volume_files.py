@@ -7,6 +7,7 @@ import SimpleITK as sitk
 
 from scenes.atomic_files import atomic_write, plain_path
 from scenes.patient_space import Space
+from scenes.volumes.file_kind import check_kind
 from scenes.volumes.itk_files import META, NRRD, itk_volume
 from scenes.volumes.lazy_volume import LazyVolume
 
@@ -28,8 +29,9 @@ def file_volume(path: Path, vectors: bool = False, space: Space | None = None) -
         space: of the axes of a file that does not name it; a file's own counts before it.
 
     Raises:
-        PatientError: damaged, not 3D, sheared, or without an orientation where no ``space`` is given.
+        PatientError: of another format than its name says, damaged, not 3D, sheared, or without an orientation where no ``space`` is given.
     """
+    check_kind(path)
     if not path.name.lower().endswith(NIFTI):
         return itk_volume(path, vectors, space)
     # nibabel takes 0.2 s to import.

@@ -10,7 +10,7 @@ import pytest
 import SimpleITK as sitk
 
 from errors import PatientError
-from scenes.atomic_files import atomic_write, new_folder
+from scenes.atomic_files import atomic_write, check_folder, new_folder
 from scenes.volumes.volume_files import file_volume, save_image
 
 
@@ -57,6 +57,43 @@ def test_a_folder_takes_the_place_of_an_empty_one_alone(tmp_path):
         made(path, "second")
     assert caught.value.filename == str(path)
     assert [each.name for each in tmp_path.iterdir()] == ["a"] and (path / "b").read_text() == "first"
+
+
+@pytest.mark.parametrize("letter", ["p", "\u00e9"])
+def test_a_name_may_be_as_long_as_the_file_system_allows(tmp_path, letter):
+    count = 250 // len(letter.encode())
+    path, folder = tmp_path / f"{letter * (count - 2)}.nii.gz"[-count:], tmp_path / (letter * count)
+    with atomic_write(path) as partial:
+        assert partial.name.endswith(".nii.gz") and len(os.fsencode(partial.name)) < 120
+        partial.write_text("a")
+    assert path.read_text() == "a"
+    check_folder(folder)
+    with new_folder(folder) as written_to:
+        (written_to / "b").touch()
+    assert {one.name for one in tmp_path.iterdir()} == {path.name, folder.name}
+
+
+@pytest.mark.parametrize("below", [[], ["a"], ["a", "b"]])
+def test_a_folder_whose_name_is_too_long_is_refused_before_the_work(tmp_path, below):
+    for folder in (tmp_path.joinpath(*below, "p" * 256), tmp_path.joinpath("p" * 256, *below)):
+        for start in (check_folder, lambda path: new_folder(path).__enter__()):
+            with pytest.raises(PatientError, match=f"{folder}: cannot be made in .*too long") as caught:
+                start(folder)
+            assert "partial" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_killed_run_left_of_a_long_name_is_its_own(tmp_path):
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    one, other = (tmp_path / f"{first}-kidney-of-the-left-side-2026" for first in ("a", "b"))
+    with atomic_write(one) as partial:
+        partial.mkdir()
+    left = tmp_path / partial.name.replace(str(os.getpid()), str(ended.pid), 1)
+    one.rename(left)
+    for folder, stays in ((other, True), (one, False)):
+        with new_folder(folder):
+            assert left.exists() == stays
 
 
 def test_the_folder_that_another_run_writes_is_not_removed(tmp_path):

@@ -1,11 +1,13 @@
 """Volumes in files, in detail: values, where a box is."""
 
+import gzip
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import SimpleITK as sitk
+from dicom_series import Series, save
 from synthetic_body import DIRECTIONS, grid_around, with_voxels
 from test_readers import AIR, RAS, affine_of, nifti, noise, written
 
@@ -25,14 +27,18 @@ class TestFiles:
     @pytest.mark.parametrize(
         ("written_as", "renamed", "words"),
         [
-            ("a.nii", "b.nii.gz", "NIfTI that is not compressed; .*rename it to end in .nii$"),
-            ("a.nii.gz", "b.nii", "is compressed; .*rename it to end in .nii.gz$"),
+            ("a.nii", "b.nii.gz", "NIfTI, not compressed by gzip; .*rename it to end in .nii$"),
+            (
+                "a.nii.gz",
+                "b.nii",
+                "NIfTI, compressed by gzip; expected NIfTI by .*rename it to end in .nii.gz$",
+            ),
             ("<!DOCTYPE html>", "b.nii.gz", "is a web page or XML"),
             ("\n<html>", "b.nii", "is a web page or XML"),
             (
                 "ten words that are no volume of anything",
                 "b.nii.gz",
-                "is not compressed by gzip; .*copy or export",
+                "is no known volume, not compressed by gzip; .*copy or export",
             ),
         ],
     )
@@ -45,6 +51,48 @@ class TestFiles:
         with pytest.raises(PatientError, match=words) as caught:
             open_ct(path)
         assert "Error" not in str(caught.value)
+
+    @pytest.mark.parametrize(
+        ("true", "named", "words"),
+        [
+            ("a.nii", "b.nrrd", "is NIfTI; expected NRRD by its name; rename it to end in .nii$"),
+            ("a.nii.gz", "b.nrrd", "is NIfTI, compressed by gzip; expected NRRD .* to end in .nii.gz$"),
+            ("a.nii.gz", "b.mha", "is NIfTI, compressed by gzip; expected MetaImage .* to end in .nii.gz$"),
+            ("a.nrrd", "b.nii", "is NRRD; expected NIfTI by its name; rename it to end in .nrrd$"),
+            ("a.nrrd", "b.nii.gz", "is NRRD, not compressed by gzip; expected NIfTI .* to end in .nrrd$"),
+            ("a.nrrd", "b.mhd", "is NRRD; expected MetaImage by its name; rename it to end in .nrrd$"),
+            ("a.mha", "b.nii", "is MetaImage; expected NIfTI by its name; rename it to end in .mha$"),
+            ("a.mha", "b.nrrd", "is MetaImage; expected NRRD by its name; rename it to end in .mha$"),
+            ("a.mha", "b.seg.nrrd", "is MetaImage; expected NRRD by its name; rename it to end in .mha$"),
+        ],
+    )
+    def test_a_volume_under_the_name_of_another_format(self, tmp_path, true, named, words):
+        path = tmp_path / named
+        written(tmp_path / true, noise()).rename(path)
+        with pytest.raises(PatientError, match=words):
+            open_ct(path)
+
+    @pytest.mark.parametrize(
+        ("true", "named", "words"),
+        [
+            (
+                "a.nrrd",
+                "b.nii.gz",
+                "is NRRD; expected NIfTI compressed .*; decompress it, and rename .* .nrrd$",
+            ),
+            ("a.mha", "b.nii", "is MetaImage, compressed by gzip; .*; decompress it, and rename .* .mha$"),
+        ],
+    )
+    def test_another_format_in_gzip(self, tmp_path, true, named, words):
+        (tmp_path / named).write_bytes(gzip.compress(written(tmp_path / true, noise()).read_bytes()))
+        with pytest.raises(PatientError, match=words):
+            open_ct(tmp_path / named)
+
+    @pytest.mark.parametrize("named", ["b.nii", "b.nrrd"])
+    def test_dicom_under_the_name_of_a_volume(self, tmp_path, named):
+        save(Series(tmp_path).slice(0), tmp_path / named)
+        with pytest.raises(PatientError, match="is DICOM; expected .* rename it to end in .dcm$"):
+            open_ct(tmp_path / named)
 
     def test_what_no_memory_holds_is_refused_with_what_it_takes(self, tmp_path, monkeypatch):
         ct = open_ct(written(tmp_path / "ct.mha", noise()))

@@ -68,6 +68,8 @@ PAGES = {
     "burned in": dict(BurnedInAnnotation="YES") | NO_PLACE,
     "colours": dict(SamplesPerPixel=3) | NO_PLACE,
     "screen save with a place": SAVED_SCREEN,
+    "burned in with a place": dict(BurnedInAnnotation="YES"),
+    "colours with a place": dict(SamplesPerPixel=3, PhotometricInterpretation="RGB"),
 }
 
 
@@ -83,7 +85,60 @@ def test_a_page_without_a_place_is_left_out_with_a_note(tmp_path, tags, count):
         )
     volume, voxels = read_ct(tmp_path)
     assert np.array_equal(voxels, expected)
-    assert f"left out, without a place in the patient, such as screen saves: {count}" in volume.notes
+    assert f"left out, no slices, such as screen saves: {count}" in volume.notes
+
+
+def with_slabs(series, count, *kind, first=0.5):
+    """The series, and images that were computed from its slices, under its own UID, from between its slices on."""
+    series.write()
+    for k in range(count):
+        tags = dict(
+            SOPInstanceUID=generate_uid(),
+            InstanceNumber=100 + k,
+            ImageType=["DERIVED", "SECONDARY", "AXIAL", *kind],
+            ImagePositionPatient=np.round(series.positions(k + first), 6).tolist(),
+        )
+        save(series.slice(k, **tags), series.folder / f"slab-{k}.dcm")
+    return series
+
+
+@pytest.mark.parametrize("first", [0.0, 0.5, 6.0])
+@pytest.mark.parametrize(
+    "kind", ["MIP", "MINIP", "AVERAGE", "PROJECTION IMAGE", "MPR", "CURVED MPR", "VRT", "CT_SOM5 MIP"]
+)
+def test_images_computed_from_the_slices_are_left_out_with_a_note(tmp_path, kind, first):
+    series = with_slabs(Series(tmp_path), 4, kind, first=first)
+    volume, voxels = read_ct(tmp_path)
+    assert np.array_equal(voxels, series.hounsfield)
+    assert "left out, computed from the slices, such as MIP and MPR: 4 images" in volume.notes
+    assert "cannot be imported" not in listing_text(tmp_path)
+
+
+@pytest.mark.parametrize("kind", [["MPR"], ["CT_SOM5 MIP"], ["AVERAGE"], []])
+def test_a_series_of_one_kind_stays_as_it_is(tmp_path, kind):
+    series = Series(tmp_path)
+    volume, voxels = read_ct(series.write(ImageType=["DERIVED", "SECONDARY", "AXIAL", *kind]))
+    assert np.array_equal(voxels, series.hounsfield) and not volume.notes
+
+
+def test_derived_slices_beside_original_ones_stay(tmp_path):
+    series = with_slabs(Series(tmp_path), 3, first=6.0)
+    volume, voxels = read_ct(tmp_path)
+    assert len(voxels) == 9 and not volume.notes and np.array_equal(voxels[:6], series.hounsfield)
+
+
+def test_slices_among_as_many_computed_images_are_refused(tmp_path):
+    with_slabs(Series(tmp_path), 6, "MIP")
+    assert "6 slices and 6 images computed from slices (MIP) are in one series" in refusal(tmp_path)
+
+
+def test_a_slice_that_is_called_computed_is_not_lost_in_silence(tmp_path):
+    series = Series(tmp_path)
+    series.write()
+    save(series.slice(3, ImageType=["DERIVED", "SECONDARY", "MPR"]), tmp_path / "s1-3.dcm")
+    message = refusal(tmp_path)
+    assert "expected no slice to be missing" in message
+    assert "left out, computed from the slices: slice 4 (s1-3.dcm)" in message
 
 
 @pytest.mark.parametrize("k", [2, 3])
@@ -93,7 +148,7 @@ def test_a_slice_that_lost_its_place_is_not_lost_in_silence(tmp_path, k):
     save(series.slice(k, **NO_PLACE), tmp_path / f"s1-{k}.dcm")
     message = refusal(tmp_path)
     assert "expected no slice to be missing" in message
-    assert f"left out, without a place in the patient: s1-{k}.dcm" in message
+    assert f"left out, no slices: s1-{k}.dcm" in message
     assert "s1-" in listing_text(tmp_path)
 
 
@@ -103,7 +158,9 @@ def test_a_series_of_which_most_has_no_place_is_refused(tmp_path, lost):
     series.write()
     for k in range(lost):
         save(series.slice(k, **NO_PLACE), tmp_path / f"s1-{k}.dcm")
-    assert f"{lost} of 6 files of this series have no ImagePositionPatient" in refusal(tmp_path)
+    message = refusal(tmp_path)
+    assert f"{lost} of 6 files of this series are no slices" in message
+    assert "s1-0.dcm: has no ImageOrientationPatient" in message
 
 
 @pytest.mark.parametrize("tag", ["ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing"])
@@ -185,6 +242,7 @@ def test_slices_with_a_series_each_are_one_series(tmp_path, direction):
         ("PixelSpacing", lambda k: [0.7 + 0.01 * k] * 2),
         ("ImagePositionPatient", lambda k: [0, 0, 2.5 * k * k]),
         ("ImagePositionPatient", lambda k: [0, 0, 5.0]),
+        ("ImageType", lambda k: ["DERIVED", "SECONDARY", ("AXIAL", "MIP")[k % 3 == 1]]),
     ],
 )
 def test_slices_that_share_no_stack_are_not_joined(tmp_path, tag, value):

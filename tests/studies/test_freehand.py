@@ -191,6 +191,25 @@ def test_sweeps_that_make_no_volume_are_refused_in_words(marked):
         reconstruct_volumes(marked, path, ALL, 0.01, "smooth", 2.0)
 
 
+@pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.parametrize("turn", [0.0, 35.0])
+def test_images_in_one_plane_are_no_volume(marked, count, turn):
+    plane = np.eye(4)
+    plane[:3, :3] = rotation_about([1, 2, 3], turn)
+    along = [plane.copy() for _ in range(count)]
+    for k, pose in enumerate(along):
+        pose[:3, 3] = 3.0 * k * plane[:3, 0]
+    sweep = sweep_of(marked.images[:count], along, np.arange(count) / 30, ON_PROBE)
+    with pytest.raises(SweepError, match=r"0\.00 mm thick, .* voxel of 1 mm; expected two images or more at"):
+        reconstruct_volumes(sweep, image_poses_of(sweep, "Reference"), ALL, 1.0, "smooth", 2.0, sweep)
+
+
+def test_images_of_one_lit_column_are_no_volume(marked):
+    column = np.arange(COLUMNS) == 40
+    with pytest.raises(SweepError, match="are in one plane"):
+        reconstruct_volumes(marked, image_poses_of(marked, "Reference"), ALL & column, 1.0, "smooth", 2.0)
+
+
 def a_box() -> VoxelBox:
     return VoxelBox(np.array([-9.5, 4.5, 40.5]), 1.0, (20, 24, 30))
 

@@ -368,6 +368,9 @@ def test_reconstruct_refuses_in_one_line(swept, tmp_path, monkeypatch):
     shutil.copy(swept, tmp_path / "a.igs.mha")
     write_sweep(tmp_path / "a-marks.igs.mha", type(sweep)(sweep.images[:3], sweep.frames[:3], sweep.fields))
     assert "labels of (3, 64, 64)" in refused("reconstruct", tmp_path / "a.igs.mha", *out)
+    write_sweep(tmp_path / "one.igs.mha", type(sweep)(sweep.images[:1], sweep.frames[:1], sweep.fields))
+    assert "expected two images or more" in refused("reconstruct", tmp_path / "one.igs.mha", *out)
+    assert not (tmp_path / "out").exists()
     sweep.images = sweep.images * np.uint8(0)
     sweep.frames[5]["Timestamp"] = "0.5"
     write_sweep(tmp_path / "black.igs.mha", sweep)

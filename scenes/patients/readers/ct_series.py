@@ -218,13 +218,17 @@ def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume
         )
     if len(series.pages) > len(series.slices):
         raise PatientError(
-            f"{path}: {len(series.pages)} of {len(series.pages) + len(series.slices)} files of this series have no ImagePositionPatient "
-            f"and ImageOrientationPatient: {listed(series.pages)}; expected a CT's slices; export the series again"
+            f"{path}: {len(series.pages)} of {len(series.pages) + len(series.slices)} files of this series are no slices: "
+            f"{next(iter(series.pages.values())).removeprefix(f'{path.name}: ')}; export the series again"
         )
     slices, strays = _one_view(series)
     notes = list(series.notes)
     if series.pages:
-        notes.append(f"left out, without a place in the patient, such as screen saves: {len(series.pages)}")
+        notes.append(f"left out, no slices, such as screen saves: {len(series.pages)}")
+    if series.projections:
+        notes.append(
+            f"left out, computed from the slices, such as MIP and MPR: {len(series.projections)} images"
+        )
     if series.localizers + len(strays):
         notes.append(f"left out, localisers: {series.localizers + len(strays)}")
     if not all(one.is_rescaled for one in slices):
@@ -233,7 +237,11 @@ def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume
     if len(positions) > 1:
         notes.append("the slices have different PatientPositions: none was taken")
     strange = [one.label for one in strays]
-    with _naming("in another view or size", strange), _naming("without a place in the patient", series.pages):
+    with (
+        _naming("in another view or size", strange),
+        _naming("no slices", list(series.pages)),
+        _naming("computed from the slices", series.projections),
+    ):
         stack = stack_slices(str(path), slices, lambda files: progress(files, "slices"))
     return replace(
         stack,

@@ -41,6 +41,11 @@ IDENTIFYING = (
 MODALITY = re.compile("[A-Z]{2,8}")
 # Values of ImageType of screen saves and dose reports, which may be in the series of their CT.
 PAGES = {"SCREEN SAVE", "DOSE_INFO"}
+# Words in values of ImageType of images that were computed from the slices of a CT, such as CT_SOM5 MIP or CURVED MPR.
+COMPUTED = frozenset({
+    "MIP", "MINIP", "MAXIP", "IP", "AVERAGE", "AVG", "PROJECTION", "REFORMATTED", "MPR", "CPR", "CURVED", "VRT", "VR", "SSD", "RENDER",
+    "RENDERED", "RENDERING",
+})  # fmt: skip
 LOCALIZERS = {"LOCALIZER", "SCOUT", "TOPOGRAM"}
 # Values of ImageType whose pixels are not HU.
 NOT_HU = {
@@ -68,6 +73,7 @@ class DicomSlice:
     is_rescaled: bool  # whether the header has a rescale
     padding: tuple[int, int] | None  # range of raw values outside the field of view
     patient_position: str = ""  # DICOM's term, such as HFS
+    computed: frozenset[str] = frozenset()  # words of its ImageType that are in COMPUTED
 
     @property
     def normal(self) -> np.ndarray:
@@ -109,9 +115,10 @@ class Series:
     slices: list[DicomSlice] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)  # a line for each slice that cannot be used
     localizers: int = 0
-    pages: list[str] = field(
+    pages: dict[str, str] = field(default_factory=dict)  # files that are no slices, and why
+    projections: list[str] = field(
         default_factory=list
-    )  # files without a place in the patient, such as screen saves
+    )  # labels of images that were computed from its slices
     other_uids: frozenset[str] = frozenset()  # of series that were joined to it
     notes: list[str] = field(default_factory=list)  # for the user
 
@@ -169,7 +176,7 @@ def read_headers(
                 series.localizers += slices.count(None)
             except PatientError as error:
                 if patient == series.patient and _is_page(header):
-                    series.pages.append(item.name)
+                    series.pages[item.name] = str(error)
                 else:
                     series.faults.append(str(error))
         elif sop_class:
@@ -179,14 +186,33 @@ def read_headers(
             raise PatientError(f"{item.name}: a damaged DICOM file (no SOPClassUID); {DAMAGED}")
         elif not is_directory:
             found.others["files of unknown kind"] += 1
+    for series in found.series.values():
+        _leave_out_projections(series)
     return found
 
 
+def _leave_out_projections(series: Series) -> None:
+    """Take images that were computed from the slices, such as MIP slabs, out of them; a series of one kind stays as it is."""
+    slices = [one for one in series.slices if not one.computed]
+    computed = [one for one in series.slices if one.computed]
+    if not slices or not computed:
+        return
+    if len(slices) > len(computed):
+        series.slices, series.projections = slices, [one.label for one in computed]
+        return
+    words = ", ".join(sorted(frozenset().union(*(one.computed for one in computed))))
+    series.faults.append(
+        f"{len(slices)} slices and {len(computed)} images computed from slices ({words}) are in one series; expected one kind"
+    )
+
+
 def _is_page(header: Dataset) -> bool:
-    """Whether an image has no place in the patient: a screen save, a dose report, or a slice that lost it."""
+    """Whether an image is no slice: a screen save, a dose report, in colours, with burned-in text, or without a place in the patient."""
     places = "ImagePositionPatient", "ImageOrientationPatient", "NumberOfFrames"
     try:
         if PAGES.intersection(map(str, header.get("ImageType") or [])):
+            return True
+        if (header.get("SamplesPerPixel") or 1) != 1 or _is_burned(header):
             return True
         # A header that ends early has lost its Rows too.
         return "Rows" in header and not any(header.get(name) for name in places)
@@ -197,7 +223,7 @@ def _is_page(header: Dataset) -> bool:
 def slices_of(item: SourceFile, header: Dataset) -> list[DicomSlice | None]:
     """The slices of one file; None for a localizer. Raises PatientError."""
     with parsing(f"{item.name}: its header cannot be read", "expected a CT's"):
-        if str(header.get("BurnedInAnnotation", "NO")).upper() == "YES":
+        if _is_burned(header):
             raise PatientError(f"{item.name}: has text burned into its pixels, which may name the patient")
         if int(header.get("SamplesPerPixel", 1)) != 1:
             raise PatientError(f"{item.name}: has colours; expected HU")
@@ -216,6 +242,11 @@ def slices_of(item: SourceFile, header: Dataset) -> list[DicomSlice | None]:
             _slice(item, n, n + 1, [*_groups(frame), *shared, header], header)
             for n, frame in enumerate(frames)
         ]
+
+
+def _is_burned(header: Dataset) -> bool:
+    """Whether there is text in the pixels."""
+    return str(header.get("BurnedInAnnotation", "NO")).upper() == "YES"
 
 
 def _groups(functional: Dataset) -> list[Dataset]:
@@ -271,6 +302,7 @@ def _slice(
         is_rescaled=value("RescaleIntercept") is not None,
         padding=_padding(header),
         patient_position=str(value("PatientPosition", "")).strip().upper(),
+        computed=COMPUTED.intersection(word for text in kind for word in re.split(r"[\W_]+", text)),
     )
 
 

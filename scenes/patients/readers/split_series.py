@@ -34,7 +34,7 @@ def _view(series: Series) -> tuple:
     axes = np.round(np.concatenate([one.row, one.column]), 3) + 0.0
     return (
         *(series.patient, series.study, series.frame_of_reference),
-        *(*axes.tolist(), *np.round(one.spacing, 4).tolist(), one.rows, one.columns),
+        *(*axes.tolist(), *np.round(one.spacing, 4).tolist(), one.rows, one.columns, bool(one.computed)),
     )
 
 
