@@ -11,9 +11,8 @@ from errors import PatientError
 from scenes.folder_files import entries_of
 from scenes.patient_space import Space
 from scenes.patients.readers.ct_series import read_dicom_headers
-from scenes.patients.readers.dicom_files import find_dicom_files
+from scenes.patients.readers.dicom_files import SourceFile, find_dicom_files
 from scenes.patients.readers.dicom_headers import DicomContents
-from scenes.patients.readers.dicom_seg import read_segmentation
 from scenes.patients.readers.label_headers import label_header
 from scenes.patients.readers.label_maps import (
     NEAR_MM,
@@ -42,7 +41,6 @@ from scenes.volumes.volume_files import ENDINGS, file_volume, is_volume_file
 SLICER_KEY = re.compile(r"Segment(\d+)_Name$")
 
 
-READERS = {"SEG": read_segmentation, "RTSTRUCT": read_structures}
 # Whether labels that refer to these objects can belong to the CT.
 Belongs = Callable[[DicomReferences], bool]
 
@@ -126,11 +124,11 @@ def segmentation_of(
 ) -> Segmentation | None:
     """The segmentation among DICOM files that belongs to the CT, or None where there is none at all. Raises PatientError."""
     if len(contents.labels) < 2:
-        return next((READERS[kind](item, wanted, progress) for kind, item in contents.labels), None)
+        return next((_read_dicom(kind, item, wanted, progress) for kind, item in contents.labels), None)
     headers = [label_header(kind, item) for kind, item in contents.labels]
     own = [header for header in headers if belongs(header.references)]
     if len(own) == 1:
-        found = READERS[own[0].kind](own[0].item, wanted, progress)
+        found = _read_dicom(own[0].kind, own[0].item, wanted, progress)
         return replace(found, notes=(*found.notes, f"left out, labels of another CT: {len(headers) - 1}"))
     patients = len({header.references.patient or header.study for header in own})
     of_patients = f" of {patients} patients" if patients > 1 else ", none of this CT," if not own else ""
@@ -140,6 +138,16 @@ def segmentation_of(
         f"{len(own or headers)} segmentations and structure sets{of_patients} were found: {names}; expected one; {choice}give its file "
         "as LABELS"
     )
+
+
+def _read_dicom(kind: str, item: SourceFile, wanted: Collection[str], progress: Progress) -> Segmentation:
+    """A DICOM-SEG or RTSTRUCT. Raises PatientError."""
+    if kind == "RTSTRUCT":
+        return read_structures(item, wanted, progress)
+    # highdicom takes a second to import.
+    from scenes.patients.readers.dicom_seg import read_segmentation
+
+    return read_segmentation(item, wanted, progress)
 
 
 def _label_map_file(path: Path, space: Space | None) -> Segmentation:
