@@ -214,8 +214,8 @@ def test_an_import_that_is_stopped_ends_in_words_and_leaves_nothing(volumes, tmp
     program.stdout.readline()
     time.sleep(after_s)
     program.send_signal(kind)
-    told = program.communicate(timeout=60)[1].decode()
-    assert (program.returncode, told.strip()) == (130, "Stopped.") and not list(tmp_path.iterdir())
+    printed = program.communicate(timeout=60)[1].decode()
+    assert (program.returncode, printed.strip()) == (130, "Stopped.") and not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("swallows", ["except BaseException: pass", "finally: sys.exit"])

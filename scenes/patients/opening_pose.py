@@ -34,7 +34,7 @@ def opening_press(
     Args:
         organ: closed surface [mm], LPS, with its tumours.
         tumour: its tumour, if there is one.
-        support: what the organ lies on.
+        support: what the organ rests on.
         gravity: its direction.
         housing_mm: the probe's, lateral x elevation x length; the lateral axis is along the organ's long axis.
     """

@@ -578,7 +578,7 @@ def test_a_kidney_in_another_language(of_segments):
 
 @pytest.mark.parametrize("name", ["hip"])
 def test_a_known_structure_in_the_kidney(of_segments, name):
-    """A name of what cannot be in a kidney leaves a hole in it: a warning tells of it."""
+    """A name of what cannot be in a kidney leaves a hole in it: a warning names it."""
     patient = of_segments([("Kidney_L", LEFT), (name, TUMOUR)])
     assert any(name in line for line in patient.warnings)
 

@@ -28,7 +28,7 @@ from ultrasound.sampled_volume import SampledVolume
 
 GAP_MM = 4.0
 WATER = acoustic_values("fluid")
-# Of 10 dB/cm/MHz, so that a layer of some millimetres can be told from none.
+# Of 10 dB/cm/MHz, so that a layer of some millimetres differs from none.
 MURKY = (WATER[0], 10.0, 0.0, 0.0)
 # The organ is between these planes of y [mm], or from the first on.
 THICKNESS_MM = 12.0
