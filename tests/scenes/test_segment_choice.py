@@ -38,7 +38,6 @@ DERIVED = [
     "Kidney_bbox",
     "Kidney_L_exp",
     "Kidney_L_expanded",
-    "Kidney_L-GTV",
     "Kidney_R-PTV",
     "Kidney~_L",
     "Kidney_L+5mm",
