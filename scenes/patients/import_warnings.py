@@ -16,6 +16,8 @@ SHELL_MM, FAT_BELOW_HU, MOST_FAT = 4.0, -60, 0.05
 OF_KIDNEY = (*PARENCHYMA, *LESIONS, *HILAR)
 # A segment touches an organ that is so many voxels away, and is in it with this share; beside it, less volume gives no warning.
 REACH, LEAST_WITHIN, LEAST_BESIDE_ML = 2, 0.5, 0.5
+# What is larger than this share of the organ is around it, as its fascia.
+MOST_WITHIN = 0.5
 MOST_PLACES = 100_000
 # Above this ``ultrasound.acoustics`` takes parenchyma for stone; less volume gives no warning.
 STONE_ABOVE_MEDIAN_HU, LEAST_STONE_ML = 130.0, 0.1
@@ -114,7 +116,7 @@ def _other_segment(one: LabelMap, value: int, piece: Organ, near: np.ndarray) ->
     places = one.grid.place(indices[:: max(1, len(indices) // MOST_PLACES)])
     share = _share_in(near, piece.grid.index(places) + REACH)
     advice = "if it is the patient's tumour or cyst, give --tumour or --cyst with its name or value"
-    if share >= LEAST_WITHIN:
+    if share >= LEAST_WITHIN and volume_ml < MOST_WITHIN * piece.volume_ml:
         known = "is of no tissue of a kidney" if segment.is_understood else "has no known tissue"
         return [
             f"label {segment} ({volume_ml:.1f} ml) in the organ {known}, and is not shown, {_place(piece, places)}; {advice}"

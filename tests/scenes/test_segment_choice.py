@@ -250,6 +250,17 @@ class TestUnknown:
         patient = import_request(ct, labels)
         np.testing.assert_allclose(patient.tumour.center_mass, TUMOUR[0], atol=2)
 
+    @pytest.mark.parametrize(("name", "lines"), [("Renal_Fascia_L", 0), ("ROI_1", 1)])
+    def test_what_is_around_the_organ_is_not_in_it(self, tmp_path, name, lines):
+        """What is known there needs no warning."""
+        ct, labels = self.write(tmp_path, "nodule", "folder")
+        image = sitk.ReadImage(str(ct))
+        around = sitk.GetImageFromArray((level(points_of(image), LARGER) < 0).astype(np.uint8))
+        around.CopyInformation(image)
+        sitk.WriteImage(around, str(labels[0] / f"{name}.nii.gz"))
+        warnings = [line for line in import_request(ct, labels).warnings if f"“{name}”" in line]
+        assert len(warnings) == lines and all("touches the organ" in line for line in warnings)
+
     def test_far_from_the_organ_there_is_none(self, tmp_path):
         ct, labels = self.write(tmp_path, "nodule", "folder")
         image = sitk.ReadImage(str(ct))
