@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 import trimesh
-from synthetic_body import LEFT, TUMOUR, body, coarsely
+from synthetic_body import DIRECTIONS, LEFT, TUMOUR, body, coarsely
 
 from app import main
 from errors import PatientError
@@ -179,3 +179,12 @@ def test_a_surface_that_states_no_space_takes_the_users(tmp_path):
     )
     np.testing.assert_allclose(patient.tumour.center_mass, LEFT[0], atol=1.0)
     assert patient.space == "RAS"
+
+
+@pytest.mark.parametrize("space", ["RAS", "LAI"])
+@pytest.mark.parametrize("direction", ["oblique", "slices first"])
+def test_axes_that_are_not_the_patients(tmp_path, direction, space):
+    """The space is that of the coordinates, and not of the voxels' axes."""
+    image = body(DIRECTIONS[direction], spacing=(6.0, 6.0, 6.0))[0]
+    path = nrrd(tmp_path / "ct.nrrd", image, "space: 3D-right-handed", signs_to_lps(space))
+    assert open_ct(path, space=space).grid.same_as(VoxelGrid.of(image))
