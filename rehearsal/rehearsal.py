@@ -5,6 +5,7 @@ The window, the headless run and every study use this class, so that they comput
 
 from concurrent.futures import Future
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import taichi as ti
@@ -17,6 +18,7 @@ from rehearsal.resection.cut import Cut, check_hilum, cut_organ, hilum_of, part_
 from rehearsal.resection.judgement import Carried, Judgement, judge
 from rehearsal.resection.resection_state import NO_RESECTION, Resection
 from rehearsal.resection.score_line import LEAST_MARKS, ResectionError, ScoreLine, score_line
+from rehearsal.tissue_voxels import tissue_voxels
 from scenes.anatomy import Grid, LoadedAnatomy
 from scenes.scene import Scene
 from scenes.surfaces import translated, volume_mm3
@@ -355,10 +357,15 @@ def shift_by(origin: np.ndarray) -> np.ndarray:
 
 
 def scanned_anatomy(
-    organ: trimesh.Trimesh, ct: Grid, anatomy: LoadedAnatomy, origin: np.ndarray
+    organ: trimesh.Trimesh, ct: Grid, anatomy: LoadedAnatomy, origin: np.ndarray, draws: bool = True
 ) -> ScannedAnatomy:
-    """The anatomy as the scanner needs it, relative to an origin; the organ is already moved there."""
+    """The anatomy as the scanner needs it, relative to an origin; the organ is already moved there.
+
+    ``draws``: also what no CT shows.
+    """
     labels, shift = anatomy.labels, shift_by(origin)
     label_values = None if labels is None else labels.voxels.astype(np.int32)
     tumour = anatomy.tumour and translated(anatomy.tumour, -origin)
-    return ScannedAnatomy(organ, ct.voxels, ct.index_from_mm @ shift, label_values, anatomy.tissues, tumour)
+    classify = None if labels is None else partial(tissue_voxels, anatomy, ct, draws, origin)
+    given = organ, ct.voxels, ct.index_from_mm @ shift, label_values, anatomy.tissues, tumour
+    return ScannedAnatomy(*given, classify)

@@ -1,16 +1,15 @@
-"""Acoustic properties of a CT's voxels from labels and HU: impedance, attenuation and backscatter. NumPy.
+"""Acoustic properties of voxels from their tissue and HU: impedance, attenuation and backscatter. NumPy.
 
-A labelled voxel has its tissue's values (``acoustic_tissues.toml``), as contrast agent raises HU by iodine, not by density. Fat and stones
-within a kidney are classified by HU: no agent lowers parenchyma to fat or raises it to stone. Enhanced urine is as bright as stone,
-so that it needs a label.
+A voxel has its tissue's values (``acoustic_tissues.toml``), as contrast agent raises HU by iodine, not by density. Within a tissue, what is
+denser in the CT scatters a little more. Voxels without a tissue have values by HU.
 """
 
 import json
 import tomllib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -33,23 +32,12 @@ MIN_HU, MAX_HU = -1024, 3071
 
 CHANNELS = IMPEDANCE, ATTENUATION, BACKSCATTER, ANISOTROPY = range(4)
 
-# Classification by HU: fat and stones of a kidney, tumour necrosis, bone, enhanced vessels.
-FAT_BELOW_HU = -30.0
+# Within a tissue, backscatter rises with HU [dB/HU], up to this much [dB]; HU are averaged over this distance.
+DB_OF_HU, MOST_OF_HU_DB, OF_HU_MM = 0.07, 3.0, 1.5
 HARD_TISSUES = ("stone", "metal")
-STONE_ABOVE_MEDIAN_HU = 130.0
-NECROSIS_BELOW_MEDIAN_HU = 40.0
-# Fat in a concavity of the kidney no wider than twice this is renal sinus.
-CONCAVITY_MM = 10.0
-# A kidney above this is enhanced by contrast agent; soft tissue above the second value is then blood.
-ENHANCED_FROM_HU, BLOOD_ABOVE_HU = 100.0, 140.0
-# Cortical bone; what only bone reaches; the least volume of that which is no stone or calcified vessel.
-SHELL_ABOVE_HU, BONE_ABOVE_HU, MIN_BONE_ML = 250.0, 350.0, 0.4
-# Bones are searched in blocks of voxels of this size, and continued beyond the CT's border as far as this.
-COARSE_MM, BEYOND_MM = 1.8, 45.0
-# Above this only metal.
-METAL_ABOVE_HU = 2500.0
-# A tumour's pseudocapsule, and the arcuate vessels: thickness of the layer, distance and share of the places that have them.
-PSEUDOCAPSULE_MM, ARCUATE_MM, ARCUATE_APART_MM, ARCUATE_SHARE = 1.0, 1.0, 2.5, 0.25
+# Arcuate vessels: thickness of the layer, distance and share of the places that have them.
+ARCUATE_MM, ARCUATE_APART_MM, ARCUATE_SHARE = 1.0, 2.5, 0.25
+UNKNOWN = "hounsfield"
 KIDNEY = ("kidney", "cortex", "medulla", "sinus", "urine")
 
 
@@ -63,16 +51,25 @@ def tissue_table() -> dict[str, dict]:
     return tomllib.loads(TISSUES.read_text("utf-8"))
 
 
+@dataclass(frozen=True)
+class TissueVoxels:
+    """HU and labels (nx, ny, nz) on a grid that ``index_from_mm`` (4, 4) gives, and the tissue of each label."""
+
+    hu: np.ndarray
+    labels: np.ndarray | None
+    tissues: Mapping[int, str]
+    index_from_mm: np.ndarray
+
+    @property
+    def spacing_mm(self) -> np.ndarray:
+        """Distance of neighbouring voxels along each axis (3,)."""
+        return np.linalg.norm(np.linalg.inv(self.index_from_mm[:3, :3]), axis=0)
+
+
 def acoustic_values(tissue: str) -> tuple[float, float, float, float]:
     """Return the mean of a tissue's values, as those of a voxel in ``properties``."""
-    table = tissue_table()[tissue]
-    level = 10 ** ((table["backscatter_db"] + CORTEX_DB) / 20)
-    return (
-        table["impedance_mrayl"],
-        table["attenuation_db_cm_mhz"],
-        level,
-        table.get("anisotropy_db", 0.0),
-    )
+    impedance, attenuation, level_db, anisotropy = acoustic_table(tissue)
+    return impedance, attenuation, 10 ** ((level_db + CORTEX_DB) / 20), anisotropy
 
 
 def check_tissues(tissue_of_label: Mapping[int, str]) -> None:
@@ -104,12 +101,10 @@ def impedance_of_tissue(hu: np.ndarray) -> np.ndarray:
     return impedance_of_hu(np.where((hu > AGENT_FROM_HU) & (hu < CALCIFIED_HU), without, hu))
 
 
-def stored_properties(
-    hu: np.ndarray, labels: np.ndarray | None, tissue_of_label: Mapping[int, str], spacing_mm: np.ndarray
-) -> np.ndarray:
-    """As ``properties``, but computed only once from the same arguments. Raises TissueError."""
-    tissues, table = json.dumps(dict(tissue_of_label)), TISSUES.read_text("utf-8")
-    return stored(_properties_of_texts, hu, labels, tissues, table, spacing_mm)[0]
+def stored_properties(voxels: TissueVoxels) -> np.ndarray:
+    """As ``properties``, but computed only once from the same voxels. Raises TissueError."""
+    tissues, table = json.dumps(dict(voxels.tissues)), TISSUES.read_text("utf-8")
+    return stored(_properties_of_texts, voxels.hu, voxels.labels, tissues, table, voxels.spacing_mm)[0]
 
 
 def _properties_of_texts(
@@ -128,37 +123,28 @@ def properties(
     """Return impedance [MRayl], attenuation [dB/cm/MHz], backscattered amplitude (1: perfect reflector) and its anisotropy [dB], (..., 4)
     float32.
 
-    ``hu`` and ``labels`` are integers of the same shape; 0 and labels without a tissue are classified by HU. Raises TissueError.
+    ``hu`` and ``labels`` have the same shape; 0 and labels without a tissue have values by HU. Raises TissueError.
     """
-    check_tissues(tissue_of_label or {})
+    tissues = dict(tissue_of_label or {})
+    check_tissues(tissues)
     spacing = np.ones(3) if spacing_mm is None else np.asarray(spacing_mm, float)
-    values, noise = _by_hounsfield(hu), {}
+    codes, names = _codes(np.zeros(hu.shape, np.uint8) if labels is None else labels, tissues)
+    values = np.empty((*hu.shape, len(CHANNELS)), np.float32)
+    by_table = np.array([acoustic_table(name) for name in names], np.float32)
+    for channel in CHANNELS:
+        values[..., channel] = by_table[codes, channel]
+    unknown = codes == 0
+    if unknown.any():
+        values[unknown] = _by_hounsfield(hu)[unknown]
     level = values[..., BACKSCATTER]
-
-    def texture(table: dict, where: Any) -> np.ndarray:
-        """Return the texture of the backscatter level at some voxels [dB]."""
-        distance = float(table["texture_mm"])
-        if distance not in noise:
-            noise[distance] = noise_of(hu.shape, distance / 2 / spacing)
-        return np.float32(table["texture_db"]) * noise[distance][where]
-
-    level += texture(tissue_table()["hounsfield"], ...)
-    # Masks by tissue, from labels and from HU and shape, in rising priority.
-    labelled: dict[str, np.ndarray] = {}
-    tissues = tissue_of_label or {}
-    if labels is not None:
-        for tissue in dict.fromkeys(tissues.values()):
-            labelled[tissue] = np.isin(labels, [v for v, name in tissues.items() if name == tissue])
-    for tissue, here in classify_tissues(hu, labelled, spacing).items():
-        labelled[tissue] = labelled[tissue] | here if tissue in labelled else here
-    labelled = {tissue: where for tissue, where in labelled.items() if where.any()}
-    hard = {tissue: labelled.pop(tissue) for tissue in HARD_TISSUES if tissue in labelled}
-    for tissue, where in labelled.items():
-        table = tissue_table()[tissue]
-        values[where, IMPEDANCE] = table["impedance_mrayl"]
-        values[where, ATTENUATION] = table["attenuation_db_cm_mhz"]
-        values[where, ANISOTROPY] = table.get("anisotropy_db", 0.0)
-        level[where] = table["backscatter_db"] + texture(table, where)
+    level += _texture(codes, names, spacing) + _variation(hu, codes, names, spacing)
+    if {"cortex", "medulla"} <= set(names):
+        where = _arcuate(codes == names.index("cortex"), codes == names.index("medulla"), spacing)
+        values[where] = acoustic_table("arcuate")
+    hard = {name: codes == names.index(name) for name in HARD_TISSUES if name in names}
+    for where in hard.values():
+        # As the tissue around it, until it is added at full impedance.
+        values[where] = acoustic_table("kidney")
     for channel in (IMPEDANCE, ATTENUATION, ANISOTROPY):
         values[..., channel] = ndimage.gaussian_filter(values[..., channel], SMOOTHING_VOXELS, truncate=2.5)
     level = ndimage.gaussian_filter(level, LEVEL_SMOOTHING_VOXELS, truncate=2.5)
@@ -166,6 +152,55 @@ def properties(
     for tissue, where in hard.items():
         _add_hard(values, tissue, where)
     return values
+
+
+def acoustic_table(tissue: str) -> tuple[float, float, float, float]:
+    """Return a tissue's values as in the table, backscatter in dB against cortex."""
+    table = tissue_table()[tissue]
+    if tissue == UNKNOWN:
+        return 0.0, 0.0, 0.0, 0.0
+    return (
+        table["impedance_mrayl"],
+        table["attenuation_db_cm_mhz"],
+        table["backscatter_db"],
+        table.get("anisotropy_db", 0.0),
+    )
+
+
+def _codes(labels: np.ndarray, tissues: Mapping[int, str]) -> tuple[np.ndarray, list[str]]:
+    """Return labels as indices of a list of tissues, of which the first is what has none."""
+    present = set(np.unique(labels).tolist())
+    names = [UNKNOWN, *dict.fromkeys(name for value, name in tissues.items() if value in present)]
+    table = np.zeros(max(present) + 1, np.uint8)
+    for value in present & tissues.keys():
+        table[value] = names.index(tissues[value])
+    return table[labels.astype(np.intp)], names
+
+
+def _texture(codes: np.ndarray, names: list[str], spacing_mm: np.ndarray) -> np.ndarray:
+    """Return how the backscatter level of each tissue varies by chance [dB]."""
+    distance = np.array([tissue_table()[name]["texture_mm"] for name in names])
+    size = np.array([tissue_table()[name]["texture_db"] for name in names], np.float32)
+    texture = np.zeros(codes.shape, np.float32)
+    for mm in np.unique(distance[size > 0]):
+        own = np.where(distance == mm, size, 0).astype(np.float32)[codes]
+        texture += own * noise_of(codes.shape, mm / 2 / spacing_mm)
+    return texture
+
+
+def _variation(hu: np.ndarray, codes: np.ndarray, names: list[str], spacing_mm: np.ndarray) -> np.ndarray:
+    """Return how the backscatter level varies with HU within a tissue [dB] (Wein et al. 2008, Med Image Anal 12, 577: echogenicity from HU).
+
+    HU are relative to the tissue's own median, so that its borders are none here, and noise can be averaged across them.
+    """
+    median = np.zeros(len(names), np.float32)
+    follows = np.zeros(len(names), np.float32)
+    for n, name in enumerate(names[1:], 1):
+        median[n] = np.median(hu[codes == n])
+        follows[n] = tissue_table()[name].get("follows_hu", False)
+    most = np.float32(MOST_OF_HU_DB / DB_OF_HU)
+    off = np.clip(hu.astype(np.float32) - median[codes], -most, most) * follows[codes]
+    return np.float32(DB_OF_HU) * ndimage.gaussian_filter(off, OF_HU_MM / spacing_mm, truncate=2)
 
 
 def _add_hard(values: np.ndarray, tissue: str, where: np.ndarray) -> None:
@@ -199,39 +234,6 @@ def noise_of(shape: tuple[int, ...], sd_voxels: np.ndarray) -> np.ndarray:
     return noise / max(float(noise.std()), 1e-6)
 
 
-def classify_tissues(
-    hu: np.ndarray, labelled: dict[str, np.ndarray], spacing_mm: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Return masks (nx, ny, nz) of tissues found besides the labelled ones, in rising priority."""
-    any_label = np.logical_or.reduce([np.zeros(hu.shape, bool), *labelled.values()])
-    bone = bones(hu, spacing_mm) & ~any_label
-    found = {"bone": bone}
-    kidney = np.logical_or.reduce([np.zeros(hu.shape, bool), *(labelled[t] for t in KIDNEY if t in labelled)])
-    if kidney.any():
-        median = float(np.median(hu[kidney]))
-        if median > ENHANCED_FROM_HU:
-            smooth = ndimage.gaussian_filter(np.asarray(hu, np.float32), 1.0, truncate=2)
-            # Away from other tissues, whose partial-volume voxels are as bright.
-            others = ndimage.binary_dilation(any_label | bone, iterations=3)
-            found["vessel"] = (smooth > BLOOD_ABOVE_HU) & ~others
-        if "sinus" not in labelled:
-            found["sinus"] = enclosed(kidney, spacing_mm) & (hu < FAT_BELOW_HU)
-        fat = kidney & (hu < FAT_BELOW_HU)
-        found["sinus"] = found["sinus"] | fat if "sinus" in found else fat
-        found["stone"] = kidney & (hu > median + STONE_ABOVE_MEDIAN_HU)
-        if median > ENHANCED_FROM_HU and "urine" in labelled:
-            # Partial-volume voxels around enhanced urine are as bright.
-            found["stone"] &= ~ndimage.binary_dilation(labelled["urine"])
-    if "cortex" in labelled and "medulla" in labelled:
-        found["arcuate"] = _arcuate(labelled["cortex"], labelled["medulla"], spacing_mm)
-    found["metal"] = hu > METAL_ABOVE_HU
-    tumour = labelled.get("tumour")
-    if tumour is not None and tumour.any():
-        found["pseudocapsule"] = _border(tumour, ~tumour, PSEUDOCAPSULE_MM, spacing_mm)
-        found["necrosis"] = tumour & (hu < np.median(hu[tumour]) - NECROSIS_BELOW_MEDIAN_HU)
-    return found
-
-
 def _arcuate(cortex: np.ndarray, medulla: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
     """Return the places between cortex and medulla where arcuate vessels are."""
     border = _border(medulla, cortex, ARCUATE_MM, spacing_mm)
@@ -251,54 +253,3 @@ def _border(
     return inside & (distance <= max(thickness_mm, spacing_mm.min()) + 1e-6)
 
 
-def enclosed(kidney: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return the closing of a kidney by a ball of CONCAVITY_MM, without the kidney."""
-    rim = np.ceil(CONCAVITY_MM / spacing_mm).astype(int) + 1
-    box = ndimage.find_objects(kidney.astype(np.uint8))[0]
-    part = np.pad(kidney[box], [(int(r), int(r)) for r in rim])
-    grown = ndimage.distance_transform_edt(~part, sampling=spacing_mm) <= CONCAVITY_MM
-    closed = ndimage.distance_transform_edt(grown, sampling=spacing_mm) > CONCAVITY_MM
-    inside = np.zeros_like(kidney)
-    inner = tuple(slice(int(r), n - int(r)) for r, n in zip(rim, part.shape, strict=True))
-    inside[box] = (closed & ~part)[inner]
-    return inside
-
-
-def bones(hu: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return cortical bone and marrow. Marrow may be no denser than enhanced soft tissue, but is enclosed by cortical bone."""
-    step = np.maximum(1, np.rint(COARSE_MM / spacing_mm)).astype(int)
-    if not (hu > BONE_ABOVE_HU).any():
-        return np.zeros(hu.shape, bool)
-    # The maximum of each block, as cortical bone may be thinner than a block.
-    coarse = ndimage.maximum_filter(hu, size=tuple(step))[:: step[0], :: step[1], :: step[2]]
-    shell = _large_parts(coarse, float(np.prod(spacing_mm * step)))
-    # A bone cut by the CT's border is continued beyond it as its mirror image.
-    beyond = [min(n, int(BEYOND_MM / (s * k))) for n, s, k in zip(shell.shape, spacing_mm, step, strict=True)]
-    whole = np.pad(shell, [(n, n) for n in beyond], mode="symmetric")
-    whole = ndimage.binary_closing(whole, iterations=2)
-    filled = np.logical_or.reduce([_filled(whole, axis) for axis in range(3)])
-    inner = filled[tuple(slice(n, n + size) for n, size in zip(beyond, shell.shape, strict=True))]
-    fine = inner.repeat(step[0], 0).repeat(step[1], 1).repeat(step[2], 2)
-    return fine[: hu.shape[0], : hu.shape[1], : hu.shape[2]]
-
-
-def _filled(solid: np.ndarray, axis: int) -> np.ndarray:
-    """Fill the holes of each section across an axis."""
-    beside = ndimage.generate_binary_structure(3, 1)
-    beside[tuple(slice(None) if k != axis else [0, 2] for k in range(3))] = False
-    parts, count = ndimage.label(~solid, beside)
-    is_open = np.zeros(count + 1, bool)
-    for other in {0, 1, 2} - {axis}:
-        for edge in (0, -1):
-            is_open[parts.take(edge, other)] = True
-    is_open[0] = False
-    return ~is_open[parts]
-
-
-def _large_parts(hu: np.ndarray, voxel_mm3: float) -> np.ndarray:
-    """Return the connected parts above SHELL_ABOVE_HU that contain MIN_BONE_ML above BONE_ABOVE_HU."""
-    parts, count = ndimage.label(hu > SHELL_ABOVE_HU)
-    hard = np.bincount(parts[hu > BONE_ABOVE_HU], minlength=count + 1) * voxel_mm3 / 1000
-    is_bone = hard >= MIN_BONE_ML
-    is_bone[0] = False
-    return is_bone[parts]

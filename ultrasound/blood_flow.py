@@ -15,12 +15,13 @@ from scipy import ndimage, sparse
 from scipy.sparse import linalg
 
 from sim.stored_arrays import stored
-from ultrasound.acoustics import KIDNEY, classify_tissues, noise_of
+from ultrasound.acoustics import KIDNEY, TissueVoxels, noise_of
 
 TABLE = Path(__file__).parent / "blood_flow.toml"
 # At each voxel: peak systolic velocity along the grid's axes [m/s], resistive index, and amplitude against blood in a vessel.
 CHANNELS = 5
-KINDS = ("vessel", "vein", "artery")
+KNOWN_KINDS = ("vein", "artery")
+KINDS = ("vessel", *KNOWN_KINDS)
 WITH_SMALL_VESSELS = ("kidney", "cortex", "medulla", "tumour")
 # Enhanced vessels without a label are of the kind of a labelled one up to this distance. Smaller bodies than this are noise.
 SAME_KIND_MM, LEAST_VOXELS = 25.0, 20
@@ -51,39 +52,33 @@ def pulse_share(time_s: float) -> float:
     return float((np.exp(-(phase - SYSTOLE_S) / FALL_S) - end) / (1 - end))
 
 
-def stored_flow(
-    hu: np.ndarray, labels: np.ndarray | None, tissue_of_label: Mapping[int, str], spacing_mm: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """As ``blood_flow`` in float16, but computed only once from the same arguments."""
-    texts = json.dumps(dict(tissue_of_label)), TABLE.read_text("utf-8")
-    low, values = stored(_flow_of_texts, hu, labels, *texts, spacing_mm)
+def stored_flow(voxels: TissueVoxels) -> tuple[np.ndarray, np.ndarray]:
+    """As ``blood_flow`` in float16, but computed only once from the same voxels."""
+    texts = json.dumps(dict(voxels.tissues)), TABLE.read_text("utf-8")
+    low, values = stored(_flow_of_texts, voxels.labels, *texts, voxels.spacing_mm)
     return low, values
 
 
 def _flow_of_texts(
-    hu: np.ndarray, labels: np.ndarray | None, tissues: str, table: str, spacing_mm: np.ndarray
+    labels: np.ndarray | None, tissues: str, table: str, spacing_mm: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     tissue_of_label = {int(label): tissue for label, tissue in json.loads(tissues).items()}
-    low, values = blood_flow(hu, labels, tissue_of_label, spacing_mm)
+    low, values = blood_flow(np.zeros((1, 1, 1), np.uint8) if labels is None else labels, tissue_of_label, spacing_mm)
     return low, values.astype(np.float16)
 
 
 def blood_flow(
-    hu: np.ndarray, labels: np.ndarray | None, tissue_of_label: Mapping[int, str], spacing_mm: np.ndarray
+    labels: np.ndarray, tissue_of_label: Mapping[int, str], spacing_mm: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the index (3,) of the first voxel of a box that contains all flow, and the flow in it (nx, ny, nz, CHANNELS) float32.
 
-    ``labels`` of the shape of ``hu``; without one, the kind of an enhanced vessel is unknown. The box has at least one voxel.
+    The kind of a vessel is its label's, or that of a labelled one nearby. The box has at least one voxel.
     """
-    masks = {name: np.zeros(hu.shape, bool) for name in (*KINDS, *KIDNEY, "tumour")}
-    if labels is not None:
-        for tissue in set(tissue_of_label.values()) | masks.keys():
-            masks[tissue] = np.isin(labels, [v for v, name in tissue_of_label.items() if name == tissue])
-    found = classify_tissues(hu, masks, spacing_mm)
-    if "vessel" in found:
-        _add_of_same_kind(masks, found["vessel"], spacing_mm)
-    if "necrosis" in found:
-        masks["tumour"] = masks["tumour"] & ~found["necrosis"]
+    masks = {
+        name: np.isin(labels, [v for v, tissue in tissue_of_label.items() if tissue == name])
+        for name in (*KINDS, *KIDNEY, "tumour")
+    }
+    _add_of_same_kind(masks, spacing_mm)
     kidney = np.logical_or.reduce([masks[name] for name in (*KIDNEY, "tumour")])
     flowing = np.logical_or.reduce([masks[name] for name in (*KINDS, *WITH_SMALL_VESSELS)])
     box = _box(flowing)
@@ -109,20 +104,19 @@ def _box(mask: np.ndarray) -> tuple[slice, ...]:
     return tuple(slice(max(a.start - 1, 0), min(a.stop + 1, n)) for a, n in zip(box, mask.shape, strict=True))
 
 
-def _add_of_same_kind(masks: dict[str, np.ndarray], found: np.ndarray, spacing_mm: np.ndarray) -> None:
-    """Add enhanced vessels without a label to the kind of the nearest labelled one."""
-    kinds = np.zeros(found.shape, np.uint8)
-    for code, kind in enumerate(KINDS, start=1):
+def _add_of_same_kind(masks: dict[str, np.ndarray], spacing_mm: np.ndarray) -> None:
+    """Change vessels of unknown kind near one of a known kind to that kind."""
+    unknown = masks["vessel"]
+    kinds = np.zeros(unknown.shape, np.uint8)
+    for code, kind in enumerate(KNOWN_KINDS, start=1):
         kinds[masks[kind]] = code
-    if kinds.any():
-        distance, nearest = ndimage.distance_transform_edt(
-            kinds == 0, sampling=spacing_mm, return_indices=True
-        )
-        near = found & (distance <= SAME_KIND_MM)
-        for code, kind in enumerate(KINDS, start=1):
-            masks[kind] = masks[kind] | (near & (kinds[tuple(nearest)] == code))
-        found = found & (distance > SAME_KIND_MM)
-    masks["vessel"] = masks["vessel"] | found
+    if not (kinds.any() and unknown.any()):
+        return
+    distance, nearest = ndimage.distance_transform_edt(kinds == 0, sampling=spacing_mm, return_indices=True)
+    near = unknown & (distance <= SAME_KIND_MM)
+    for code, kind in enumerate(KNOWN_KINDS, start=1):
+        masks[kind] = masks[kind] | (near & (kinds[tuple(nearest)] == code))
+    masks["vessel"] = unknown & ~near
 
 
 def _add_small_vessels(

@@ -324,15 +324,16 @@ class BMode:
         for n in range(self.lines * TASK):
             if n % TASK == 0:
                 for k in range(1, self.samples // stride + 1):
-                    if self.sound.echo[n // TASK, k].z > 0.0:
-                        self.reflect(
-                            has_speckle, n // TASK, k, stride * sample_mm, sample_mm, speckle_sd, look
-                        )
+                    for kind in ti.static(range(2)):
+                        echo = (self.sound.echo, self.sound.capsule)[kind][n // TASK, k]
+                        if echo.z > 0.0:
+                            self.reflect(
+                                has_speckle, n // TASK, k, echo, stride * sample_mm, sample_mm, speckle_sd, look
+                            )
 
     @ti.func
-    def reflect(self, has_speckle: ti.template(), line, k, step_mm, sample_mm, speckle_sd, look):
-        """Add the echo of the interface in front of a tissue sample: as long as the pulse."""
-        echo = self.sound.echo[line, k]
+    def reflect(self, has_speckle: ti.template(), line, k, echo, step_mm, sample_mm, speckle_sd, look):
+        """Add an echo in front of a tissue sample: as long as the pulse."""
         amplitude, path = self.sound.echo_amplitude(line, echo, step_mm)
         diffuse, sd = tm.vec2(0.0, 0.0), self.axial_sd[0]
         if ti.static(has_speckle):

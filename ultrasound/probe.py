@@ -109,7 +109,7 @@ class Probe(BaseModel):
     colour_gain_percent: Percent = 50.0
     colour_steering_deg: float = Field(0.0, ge=-30, le=30)
     time_gain_compensation: Sliders = (50.0,) * TGC_SLIDERS
-    depth_compensation_db_cm_mhz: float = Field(0.95, ge=0, le=5)
+    depth_compensation_db_cm_mhz: float = Field(0.65, ge=0, le=5)
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Probe":

@@ -3,7 +3,7 @@
 CT slice: image plane -> deformed tetrahedra -> voxels at rest (the paper's method).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,7 +15,7 @@ import trimesh
 from trimesh.intersections import mesh_plane
 
 from sim.embedding import Embedding, Unmoved
-from ultrasound.acoustics import check_tissues, stored_properties
+from ultrasound.acoustics import TissueVoxels, check_tissues, stored_properties
 from ultrasound.blood_flow import stored_flow
 from ultrasound.bmode import BMode, Wavefront
 from ultrasound.crater import Box, Crater
@@ -43,7 +43,8 @@ IMAGES_OF_MODE: dict[Mode, tuple[str, ...]] = {"ct": (CT,), "b-mode": (B_MODE,),
 class ScannedAnatomy:
     """The anatomy at rest, all in one coordinate system [mm].
 
-    ``hu`` (nx, ny, nz) and ``labels`` on the same grid, with ``index_from_mm`` (4, 4); ``tissues`` are the tissues by label.
+    ``hu`` (nx, ny, nz) and ``labels`` on the same grid, with ``index_from_mm`` (4, 4); ``tissues`` are the tissues by label. ``classify``
+    returns the tissue of every voxel, on a grid of its own; without it, what has no label has the acoustic properties of its HU.
     """
 
     organ: trimesh.Trimesh
@@ -52,6 +53,14 @@ class ScannedAnatomy:
     labels: np.ndarray | None = None
     tissues: Mapping[int, str] = field(default_factory=dict)
     tumour: trimesh.Trimesh | None = None
+    classify: Callable[[], TissueVoxels] | None = None
+
+    @cached_property
+    def voxels(self) -> TissueVoxels:
+        """The tissue of each voxel: classified, or as labelled."""
+        if self.classify is not None:
+            return self.classify()
+        return TissueVoxels(self.hu, self.labels, self.tissues, self.index_from_mm)
 
     @property
     def voxel_mm(self) -> np.ndarray:
@@ -67,7 +76,7 @@ def shows_ct(outside: str) -> bool:
 def start_acoustics(anatomy: ScannedAnatomy) -> Future[np.ndarray]:
     """Start computing the acoustic properties that B-mode images need, on a thread of its own."""
     worker = ThreadPoolExecutor(1)
-    values = worker.submit(stored_properties, anatomy.hu, anatomy.labels, anatomy.tissues, anatomy.voxel_mm)
+    values = worker.submit(lambda: stored_properties(anatomy.voxels))
     worker.shutdown(wait=False)
     return values
 
@@ -129,17 +138,18 @@ class Scanner:
     def tissue(self) -> SampledVolume:
         """Acoustic properties at rest."""
         values, self._acoustics = (self._acoustics or start_acoustics(self.anatomy)).result(), None
-        return self._with_crater("tissue", SampledVolume(values, self.anatomy.index_from_mm, outside=0.0))
+        to_index = self.anatomy.voxels.index_from_mm
+        return self._with_crater("tissue", SampledVolume(values, to_index, outside=0.0))
 
     @cached_property
     def flow(self) -> SampledVolume:
         """Blood flow at rest, of ``blood_flow.CHANNELS``; no flow where the anatomy has no vessels."""
-        anatomy = self.anatomy
-        low, values = stored_flow(anatomy.hu, anatomy.labels, anatomy.tissues, anatomy.voxel_mm)
+        voxels = self.anatomy.voxels
+        low, values = stored_flow(voxels)
         values = values.astype(np.float32)
-        axes = np.linalg.inv(anatomy.index_from_mm[:3, :3]) / anatomy.voxel_mm
+        axes = np.linalg.inv(voxels.index_from_mm[:3, :3]) / voxels.spacing_mm
         values[..., :3] = values[..., :3] @ axes.T.astype(np.float32)
-        from_mm = anatomy.index_from_mm.copy()
+        from_mm = voxels.index_from_mm.copy()
         from_mm[:3, 3] -= low
         return self._with_crater("flow", SampledVolume(values, from_mm, outside=0.0))
 
@@ -170,7 +180,7 @@ class Scanner:
         return volume
 
     def _propagation(self) -> Propagation:
-        voxel_mm = float(self.anatomy.voxel_mm.mean())
+        voxel_mm = float(self.anatomy.voxels.spacing_mm.mean())
         around = self.contact, self.contact_gap_mm, self.around, self.has_fluid
         return Propagation(self.tissue, self.organ, self.plane, self.probe, voxel_mm, *around)
 

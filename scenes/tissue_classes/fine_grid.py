@@ -1,0 +1,118 @@
+"""A finer grid for CTs with thick slices: HU interpolated linearly, labels by their distances (Raya & Udupa 1990, IEEE Trans Med Imaging 9, 32).
+
+Without it, the border of an organ in slices of 5 mm is a stair, and each of its steps an interface of its own in the B-mode image.
+"""
+
+import numpy as np
+import trimesh
+from scipy import ndimage
+
+from scenes.surfaces import signed_distance_from
+
+# Voxels are divided until they are no longer than this.
+LONGEST_MM = 1.6
+# Distances from the organ's surface are computed at this spacing, and interpolated.
+SURFACE_MM = 2.0
+FAR_MM = 1e4
+Box = tuple[slice, ...]
+
+
+def fine_factors(spacing_mm: np.ndarray) -> np.ndarray:
+    """Return into how many voxels each is divided along each axis (3,)."""
+    return np.maximum(np.ceil(np.asarray(spacing_mm) / LONGEST_MM - 1e-6), 1).astype(int)
+
+
+def fine_index_from_mm(index_from_mm: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Return the transform (4, 4) from mm to the indices of the finer grid, whose first voxel begins where the CT's first does."""
+    scale = np.diag([*factors.astype(float), 1.0])
+    scale[:3, 3] = (factors - 1) / 2
+    return scale @ index_from_mm
+
+
+def refined(values: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Return values (nx, ny, nz) float32 on the finer grid, linear between the voxels' centres."""
+    fine = np.asarray(values, np.float32)
+    for axis, factor in enumerate(factors):
+        if factor > 1:
+            count = fine.shape[axis]
+            at = np.clip((np.arange(count * factor) + 0.5) / factor - 0.5, 0, count - 1)
+            low = np.minimum(at.astype(int), max(count - 2, 0))
+            share = (at - low).astype(np.float32).reshape([-1 if k == axis else 1 for k in range(3)])
+            high = np.minimum(low + 1, count - 1)
+            fine = fine.take(low, axis) * (1 - share) + fine.take(high, axis) * share
+    return fine
+
+
+def refined_labels(labels: np.ndarray, factors: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
+    """Return labels on the finer grid: of each voxel the label that it is deepest in, 0 where it is in none."""
+    if (factors == 1).all():
+        return labels
+    fine = np.zeros(np.array(labels.shape) * factors, labels.dtype)
+    depth = np.zeros(fine.shape, np.float32)
+    for code in np.unique(labels[labels > 0]):
+        box = box_around(labels == code, 2)
+        part = labels[box] == code
+        distance = signed_distance_of(part, spacing_mm)
+        own = tuple(slice(a.start * f, a.stop * f) for a, f in zip(box, factors, strict=True))
+        inside = -refined(distance, factors)
+        deeper = inside > depth[own]
+        fine[own][deeper] = code
+        depth[own][deeper] = inside[deeper]
+    return fine
+
+
+def signed_distance_of(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
+    """Return distances [mm] (nx, ny, nz) from the border of a mask, half a voxel off its voxels' centres; negative inside."""
+    half = float(np.mean(spacing_mm)) / 2
+    outside = ndimage.distance_transform_edt(~mask, sampling=spacing_mm)
+    inside = ndimage.distance_transform_edt(mask, sampling=spacing_mm)
+    return np.where(mask, half - inside, outside - half).astype(np.float32)
+
+
+def box_around(mask: np.ndarray, voxels: int) -> Box:
+    """Return the box around a mask that is not empty, some voxels wider, within its grid."""
+    found = ndimage.find_objects(mask.astype(np.uint8))[0]
+    return tuple(
+        slice(max(a.start - voxels, 0), min(a.stop + voxels, n))
+        for a, n in zip(found, mask.shape, strict=True)
+    )
+
+
+def surface_box(
+    surface: trimesh.Trimesh, index_from_mm: np.ndarray, shape: tuple[int, ...], margin_mm: float
+) -> Box:
+    """Return the voxels of a grid around a surface, with a margin."""
+    corners = trimesh.bounds.corners(surface.bounds + [[-margin_mm], [margin_mm]])
+    at = corners @ index_from_mm[:3, :3].T + index_from_mm[:3, 3]
+    low = np.clip(np.floor(at.min(axis=0)), 0, np.array(shape) - 1).astype(int)
+    high = np.clip(np.ceil(at.max(axis=0)) + 1, 1, shape).astype(int)
+    return tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+
+
+class SurfaceGrid:
+    """Points SURFACE_MM apart around a closed surface, at which ``distance`` [mm] from it is known, negative inside.
+
+    ``at_voxels`` interpolates values at them for a box of another grid.
+    """
+
+    def __init__(self, surface: trimesh.Trimesh, margin_mm: float) -> None:
+        self.low = surface.bounds[0] - margin_mm
+        counts = np.ceil((np.ptp(surface.bounds, axis=0) + 2 * margin_mm) / SURFACE_MM).astype(int) + 1
+        points = self.low + SURFACE_MM * np.moveaxis(np.indices(counts), 0, -1)
+        self.distance = signed_distance_from(surface, points.reshape(-1, 3)).reshape(counts)
+
+    def at_voxels(
+        self, values: np.ndarray, box: Box, index_from_mm: np.ndarray
+    ) -> np.ndarray:
+        """Return values of this grid at the voxels of a box, float32; of the nearest point outside it."""
+        mm_from_index = np.linalg.inv(index_from_mm)
+        to_grid = mm_from_index[:3, :3] / SURFACE_MM
+        first = mm_from_index[:3, :3] @ [a.start for a in box] + mm_from_index[:3, 3]
+        return ndimage.affine_transform(
+            values.astype(np.float32),
+            to_grid,
+            (first - self.low) / SURFACE_MM,
+            output_shape=tuple(a.stop - a.start for a in box),
+            order=1,
+            mode="nearest",
+        )

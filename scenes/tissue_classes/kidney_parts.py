@@ -1,0 +1,64 @@
+"""Parts of a kidney that nobody labelled, by HU, depth and contrast phase: sinus, vessels of the hilum, cortex and medulla."""
+
+from typing import Literal
+
+import numpy as np
+from scipy import ndimage
+
+Phase = Literal["unenhanced", "corticomedullary", "nephrographic", "excretory"]
+
+# Parenchyma above this has contrast agent: without, it has 30 to 50 HU.
+ENHANCED_FROM_HU = 75.0
+# Cortex is brighter than medulla by this, or more, in the corticomedullary phase. The outer part of the parenchyma is cortex, the inner
+# part has both.
+CORTEX_ABOVE_MEDULLA_HU, OUTER_MM, INNER_MM, LEAST_VOXELS = 40.0, (2.0, 5.0), (9.0, 16.0), 50
+# Fat nearer to the kidney's outer surface than this is partial volume of its label's rim.
+RIM_MM = 5.0
+FAT_BELOW_HU = -20.0
+# In the hollow of a kidney, what is brighter is a vessel or the pelvis: without contrast agent, and as a share of the parenchyma's HU.
+VESSEL_ABOVE_HU, ENHANCED_VESSEL_SHARE = 15.0, 0.6
+# In a kidney with contrast agent, what has less than this share of the parenchyma's HU is sinus or a calyx without.
+SINUS_SHARE = 0.5
+
+
+def median_hu(hu: np.ndarray, parenchyma: np.ndarray) -> float:
+    """Return the median HU of parenchyma; 0 of none."""
+    return float(np.median(hu[parenchyma])) if parenchyma.any() else 0.0
+
+
+def kidney_parts(
+    hu: np.ndarray, parenchyma: np.ndarray, hollow: np.ndarray, depth_mm: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return masks (nx, ny, nz) of the parts of a kidney by tissue, apart from each other: "kidney", or "cortex" and "medulla", and others.
+
+    Args:
+        hu: smoothed.
+        parenchyma: what is labelled as kidney, and as no part of it.
+        hollow: what the kidney encloses outside its label.
+        depth_mm: below the kidney's outer surface, its hollow filled.
+    """
+    median = median_hu(hu, parenchyma)
+    is_enhanced = median > ENHANCED_FROM_HU
+    deep = parenchyma & (depth_mm > RIM_MM)
+    vessel = hollow & (hu > (ENHANCED_VESSEL_SHARE * median if is_enhanced else VESSEL_ABOVE_HU))
+    sinus = (hollow & ~vessel) | (deep & (hu < FAT_BELOW_HU))
+    if is_enhanced:
+        sinus |= deep & (hu < SINUS_SHARE * median)
+    rest = parenchyma & ~sinus
+    masks = {"sinus": sinus, "vessel": vessel}
+    border = border_of_cortex(hu, rest, depth_mm) if is_enhanced else None
+    if border is None:
+        return masks | {"kidney": rest}
+    medulla = ndimage.binary_opening(rest & (hu < border) & (depth_mm > OUTER_MM[0]))
+    return masks | {"medulla": medulla, "cortex": rest & ~medulla}
+
+
+def border_of_cortex(hu: np.ndarray, parenchyma: np.ndarray, depth_mm: np.ndarray) -> float | None:
+    """Return the HU between cortex and medulla; None where the phase does not tell them apart."""
+    outer, inner = (
+        hu[parenchyma & (depth_mm > low) & (depth_mm < high)] for low, high in (OUTER_MM, INNER_MM)
+    )
+    if min(len(outer), len(inner)) < LEAST_VOXELS:
+        return None
+    cortex, medulla = float(np.median(outer)), float(np.percentile(inner, 25))
+    return (cortex + medulla) / 2 if cortex - medulla > CORTEX_ABOVE_MEDULLA_HU else None

@@ -1,0 +1,164 @@
+"""Tissues around a kidney by HU, place and shape: gas, fat, vessels, liver, spleen, muscle and bowel."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+from skimage.feature import peak_local_max
+from skimage.segmentation import watershed
+
+GAS_BELOW_HU, FAT_BELOW_HU, METAL_ABOVE_HU = -300.0, -30.0, 2500.0
+# With contrast agent, blood is brighter than this, and contrast agent in the ureter and bowel than the second value.
+BLOOD_ABOVE_HU, DENSE_ABOVE_HU = 140.0, 260.0
+# Marrow where its shell is not closed: share of its surface that is bone; without contrast agent, by its HU and volume.
+MARROW_SURFACE, MARROW_ABOVE_HU, LEAST_MARROW_ML = 0.4, 120.0, 0.4
+# Of an enhanced CT, muscle is darker than this, liver and spleen are brighter. Fluid in the bowel is darker than the third value.
+LIVER_ABOVE_HU, FLUID_BELOW_HU = 88.0, 32.0
+# Large bodies of soft tissue are searched in cells of this size; they contain a ball of the first radius, liver and spleen of the second.
+CELL_MM, BODY_MM, ORGAN_MM = 3.0, 7.0, 12.0
+# Without contrast agent, muscle is behind or beside the spine: so far behind the kidney's middle, so near to the spine's.
+BEHIND_MM, BESIDE_SPINE_MM = 25.0, 45.0
+# Soft tissue so near to gas is bowel.
+BOWEL_WALL_MM = 12.0
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a kidney is in a CT: ``index_from_mm`` (4, 4), its middle (3,), LPS [mm], and whether it has contrast agent."""
+
+    index_from_mm: np.ndarray
+    middle_mm: np.ndarray
+    is_enhanced: bool
+
+    @property
+    def spacing_mm(self) -> np.ndarray:
+        return np.linalg.norm(np.linalg.inv(self.index_from_mm[:3, :3]), axis=0)
+
+    def of_indices(self, index: np.ndarray) -> np.ndarray:
+        """Return places (n, 3) of indices (n, 3), from the kidney's middle [mm]."""
+        mm_from_index = np.linalg.inv(self.index_from_mm)
+        return index @ mm_from_index[:3, :3].T + mm_from_index[:3, 3] - self.middle_mm
+
+
+def surroundings(
+    hu: np.ndarray, kidney: np.ndarray, bone: np.ndarray, near: tuple[slice, ...], place: Place
+) -> dict[str, np.ndarray]:
+    """Return masks (nx, ny, nz) by tissue of what is outside a kidney, in rising priority.
+
+    ``hu`` is smoothed; ``near`` is a box around the kidney.
+    """
+    gas = (hu < GAS_BELOW_HU) & ~kidney
+    bone = bone | _marrow(hu, bone, kidney, place)
+    fat = (hu < FAT_BELOW_HU) & ~gas & ~kidney
+    beside = _dilated(kidney[near], 2)
+    # Voxels between kidney and fat have the HU of other soft tissue, by partial volume.
+    fat[near] |= beside & _dilated(fat[near], 2) & ~kidney[near] & ~gas[near]
+    soft = ~(bone | gas | fat | kidney)
+    masks = {"soft-tissue": soft, "fat": fat, "gas": gas}
+    masks |= _bodies(hu, soft, bone, place)
+    masks["bowel"] = soft & _near(gas & ~_open_air(gas), BOWEL_WALL_MM, place.spacing_mm) & ~masks["muscle"]
+    if place.is_enhanced:
+        vessel = soft & (hu > BLOOD_ABOVE_HU) & (hu < DENSE_ABOVE_HU)
+        vessel[near] &= ~beside
+        masks["vessel"] = vessel
+    return masks | {"bone": bone, "metal": hu > METAL_ABOVE_HU}
+
+
+def _marrow(hu: np.ndarray, bone: np.ndarray, kidney: np.ndarray, place: Place) -> np.ndarray:
+    """Return bright pieces whose surface is bone for the most part; without contrast agent, all large bright pieces."""
+    bright = (hu > (BLOOD_ABOVE_HU if place.is_enhanced else MARROW_ABOVE_HU)) & ~kidney & ~bone
+    pieces, count = ndimage.label(bright)
+    sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+    if place.is_enhanced:
+        surface = _dilated(bright, 1) & ~bright
+        around = ndimage.maximum_filter(pieces, 3)
+        touched = np.bincount(around[surface & bone], minlength=count + 1)
+        chosen = touched > MARROW_SURFACE * np.bincount(around[surface], minlength=count + 1)
+    else:
+        chosen = sizes * np.prod(place.spacing_mm) / 1000 > LEAST_MARROW_ML
+    chosen[0] = False
+    return chosen[pieces]
+
+
+def _dilated(mask: np.ndarray, voxels: int) -> np.ndarray:
+    """Return a mask dilated by a cube: a maximum filter is faster than a dilation."""
+    return ndimage.maximum_filter(mask, 2 * voxels + 1)
+
+
+def _open_air(gas: np.ndarray) -> np.ndarray:
+    """Return the gas that reaches the border of the CT: the air around the body, or a lung."""
+    parts, count = ndimage.label(gas)
+    at_border = np.zeros(count + 1, bool)
+    for axis in range(3):
+        for end in (0, -1):
+            at_border[parts.take(end, axis)] = True
+    at_border[0] = False
+    return at_border[parts]
+
+
+def _near(mask: np.ndarray, distance_mm: float, spacing_mm: np.ndarray) -> np.ndarray:
+    """Return what is within a distance of a mask, by steps of voxels."""
+    if not mask.any():
+        return mask
+    step = np.maximum(np.rint(CELL_MM / spacing_mm), 1).astype(int)
+    coarse = ndimage.maximum_filter(mask, tuple(step))[:: step[0], :: step[1], :: step[2]]
+    near = ndimage.distance_transform_edt(~coarse, sampling=spacing_mm * step) <= distance_mm
+    return _repeated(near, step, mask.shape)
+
+
+def _repeated(coarse: np.ndarray, step: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    fine = coarse.repeat(step[0], 0).repeat(step[1], 1).repeat(step[2], 2)
+    return fine[: shape[0], : shape[1], : shape[2]]
+
+
+def _bodies(hu: np.ndarray, soft: np.ndarray, bone: np.ndarray, place: Place) -> dict[str, np.ndarray]:
+    """Return liver, spleen and muscle: soft tissue in large bodies."""
+    step = np.maximum(np.rint(CELL_MM / place.spacing_mm), 1).astype(int)
+    cell_mm = place.spacing_mm * step
+    every = tuple(slice(None, None, k) for k in step)
+    mean, inside = ndimage.uniform_filter(hu, tuple(step))[every], soft[every]
+    depth = ndimage.gaussian_filter(ndimage.distance_transform_edt(inside, sampling=cell_mm), 1.0)
+    peaks = peak_local_max(depth, min_distance=3, threshold_abs=BODY_MM, exclude_border=False)
+    seeds = np.zeros(inside.shape, np.int32)
+    seeds[tuple(peaks.T)] = np.arange(1, len(peaks) + 1)
+    basins = watershed(-depth, seeds, mask=inside)
+    spine = _spine(bone[every], step, place)
+    names = ["soft-tissue"]
+    for n, peak in enumerate(peaks, 1):
+        own = basins == n
+        level = float(np.median(mean[own & (depth > depth[own].max() / 3)]))
+        at = place.of_indices(np.argwhere(own).mean(axis=0)[None] * step)[0]
+        names.append(_body(level, float(depth[tuple(peak)]), at, spine, place.is_enhanced))
+    found = np.array([("muscle", "liver", "spleen").index(n) + 1 if n != "soft-tissue" else 0 for n in names])
+    codes = _repeated(found[basins].astype(np.uint8), step, soft.shape)
+    return {name: soft & (codes == code) for code, name in enumerate(("muscle", "liver", "spleen"), 1)}
+
+
+def _spine(bone: np.ndarray, step: np.ndarray, place: Place) -> np.ndarray | None:
+    """Return the middle (3,) of the largest bone, from the kidney's [mm]; None without one."""
+    parts, count = ndimage.label(bone)
+    if count == 0:
+        return None
+    largest = parts == 1 + np.argmax(np.bincount(parts.ravel())[1:])
+    return place.of_indices(np.argwhere(largest).mean(axis=0)[None] * step)[0]
+
+
+def _body(
+    level_hu: float, radius_mm: float, at: np.ndarray, spine: np.ndarray | None, is_enhanced: bool
+) -> str:
+    """Return the tissue of a body of soft tissue by its HU, the ball in it, and its place from the kidney [mm]."""
+    if level_hu < FLUID_BELOW_HU - (0 if is_enhanced else 20):
+        return "soft-tissue"
+    beside_spine = spine is not None and abs(at[0] - spine[0]) < BESIDE_SPINE_MM and at[1] > spine[1] - 25.0
+    if is_enhanced:
+        is_muscle = level_hu < LIVER_ABOVE_HU
+    else:
+        is_muscle = at[1] > BEHIND_MM or beside_spine
+    if is_muscle:
+        return "muscle"
+    if spine is None or radius_mm < ORGAN_MM:
+        return "soft-tissue"
+    # The spine is on the right of the left kidney.
+    if spine[0] > 0:
+        return "liver"
+    return "spleen" if at[0] > 0.0 else "soft-tissue"

@@ -1,0 +1,198 @@
+"""The tissue of every voxel around a kidney: labels where there are any, and the CT's HU, place and contrast phase elsewhere.
+
+What no CT shows (pyramids without enhancement, the renal fascia) is drawn on request, and marked.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import SimpleITK as sitk
+import trimesh
+from scipy import ndimage
+
+from scenes.tissue_classes.bones import bones
+from scenes.tissue_classes.collecting_system import DensePieces, dense_pieces
+from scenes.tissue_classes.drawn_anatomy import MOST_MM, draw_fascia, draw_pyramids
+from scenes.tissue_classes.fine_grid import (
+    FAR_MM,
+    SURFACE_MM,
+    Box,
+    SurfaceGrid,
+    box_around,
+    fine_factors,
+    fine_index_from_mm,
+    refined,
+    refined_labels,
+    surface_box,
+)
+from scenes.tissue_classes.kidney_parts import kidney_parts
+from scenes.tissue_classes.lesion_parts import lesion_parts
+from scenes.tissue_classes.surroundings import Place, surroundings
+
+# In the order of their codes.
+TISSUES = (
+    *("gas", "fat", "fascia", "soft-tissue", "muscle", "liver", "spleen", "bowel", "bone", "metal", "fluid"),
+    *("kidney", "cortex", "medulla", "arcuate", "sinus", "urine", "stone", "vessel", "artery", "vein"),
+    *("tumour", "pseudocapsule", "necrosis", "cyst"),
+)
+CODE = {name: code for code, name in enumerate(TISSUES, 1)}
+PARENCHYMA = ("kidney", "cortex", "medulla")
+# Behind the fat in which the renal fascia is.
+BEHIND_FASCIA = ("muscle", "liver", "spleen")
+# A hollow of the kidney is where no ball of this radius fits in.
+CONCAVITY_MM = 10.0
+MARGIN_MM = MOST_MM + 4.0
+
+
+@dataclass(frozen=True)
+class TissueMap:
+    """Tissue of each voxel (nx, ny, nz): ``codes`` of TISSUES from 1, uint8, on a grid that ``index_from_mm`` (4, 4) gives.
+
+    ``hu`` is on the same grid. ``drawn`` is what no CT shows.
+    """
+
+    codes: np.ndarray
+    hu: np.ndarray
+    drawn: np.ndarray
+    index_from_mm: np.ndarray
+
+    def mask(self, *tissues: str) -> np.ndarray:
+        """Return whether a voxel is of one of some tissues."""
+        return of_tissues(self.codes, *tissues)
+
+
+@dataclass(frozen=True)
+class KidneyShape:
+    """In a ``box`` of a grid: distances [mm] from the organ's surface, and from it with its hollows filled; negative inside."""
+
+    box: Box
+    distance_mm: np.ndarray
+    outer_mm: np.ndarray
+
+    @classmethod
+    def of(cls, organ: trimesh.Trimesh, index_from_mm: np.ndarray, shape: tuple[int, ...]) -> "KidneyShape":
+        """Return that of a surface [mm] on a grid."""
+        grid = SurfaceGrid(organ, MARGIN_MM)
+        box = surface_box(organ, index_from_mm, shape, MARGIN_MM)
+        both = grid.distance, _outer_distance(grid.distance)
+        return cls(box, *(grid.at_voxels(values, box, index_from_mm) for values in both))
+
+    @property
+    def inside(self) -> np.ndarray:
+        """Whether a voxel of the box is in the organ."""
+        return self.distance_mm < 0
+
+    @property
+    def hollow(self) -> np.ndarray:
+        """Whether a voxel of the box is in a hollow of the organ."""
+        return (self.outer_mm < 0) & (self.distance_mm >= 0)
+
+
+def tissue_map(
+    hu: np.ndarray,
+    labels: np.ndarray,
+    tissues: Mapping[int, str],
+    organ: trimesh.Trimesh,
+    index_from_mm: np.ndarray,
+    draws: bool = True,
+) -> TissueMap:
+    """Return the tissue of each voxel of a CT around a kidney.
+
+    Args:
+        hu: (nx, ny, nz) [HU].
+        labels: on the same grid.
+        tissues: the tissue of each label, one of TISSUES.
+        organ: its surface [mm].
+        index_from_mm: (4, 4), from patient coordinates, LPS.
+        draws: also what no CT shows.
+    """
+    spacing = np.linalg.norm(np.linalg.inv(index_from_mm[:3, :3]), axis=0)
+    factors = fine_factors(spacing)
+    own = refined_labels(_codes_of(labels, tissues), factors, spacing)
+    sharp, smooth = refined(hu, factors), refined(_median(hu, spacing), factors)
+    to_index = fine_index_from_mm(index_from_mm, factors)
+    shape = KidneyShape.of(organ, to_index, own.shape)
+    bone = refined(bones(hu, spacing) & (labels == 0), factors) > 0.5
+    box = shape.box
+    dense = _dense(sharp[box], own[box], shape, float(np.prod(spacing / factors)) / 1000)
+    place = Place(to_index, np.asarray(organ.center_mass), dense.is_enhanced)
+    codes = np.zeros(own.shape, np.uint8)
+    inside = np.zeros(own.shape, bool)
+    inside[box] = shape.inside
+    _write(codes, surroundings(smooth, inside, bone & ~inside, box, place))
+    drawn = np.zeros(own.shape, bool)
+    kidney = shape.inside & np.isin(own[box], [0, CODE["kidney"]])
+    _write(codes[box], kidney_parts(smooth[box], kidney, shape.hollow, -shape.outer_mm))
+    _write(codes[box], {"urine": dense.urine})
+    if draws:
+        drawn[box] = _draw(codes[box], kidney, shape, place.spacing_mm)
+    _write_labels(codes, own, sharp, place.spacing_mm)
+    _write(codes[box], {"stone": dense.stone})
+    return TissueMap(codes, sharp, drawn & (own == 0) | drawn & (own == CODE["kidney"]), to_index)
+
+
+def of_tissues(codes: np.ndarray, *tissues: str) -> np.ndarray:
+    """Return whether codes are of one of some tissues."""
+    return np.isin(codes, [CODE[name] for name in tissues])
+
+
+def _codes_of(labels: np.ndarray, tissues: Mapping[int, str]) -> np.ndarray:
+    """Return labels as codes of TISSUES, 0 where a label has no tissue."""
+    table = np.zeros(max(int(labels.max()), *tissues, 0) + 1, np.uint8)
+    for value, tissue in tissues.items():
+        table[value] = CODE[tissue]
+    return table[labels.astype(np.intp)]
+
+
+def _median(hu: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
+    """Return the median of each voxel and its neighbours: noise goes, edges stay. Thick slices are not mixed."""
+    radius = [0 if mm > 2 * spacing_mm.min() else 1 for mm in spacing_mm]
+    image = sitk.GetImageFromArray(np.ascontiguousarray(hu, np.float32))
+    return sitk.GetArrayFromImage(sitk.Median(image, radius[::-1]))
+
+
+def _outer_distance(distance_mm: np.ndarray) -> np.ndarray:
+    """Return distances [mm] from a surface whose hollows are filled, on the grid of a SurfaceGrid: closing by a ball."""
+    near = distance_mm <= CONCAVITY_MM
+    # From the middles of points: half of their distance is not known.
+    inside = ndimage.distance_transform_edt(near, sampling=SURFACE_MM) - SURFACE_MM / 2
+    return np.minimum(distance_mm, np.where(near, CONCAVITY_MM - inside, FAR_MM)).astype(np.float32)
+
+
+def _dense(hu: np.ndarray, own: np.ndarray, shape: KidneyShape, voxel_ml: float) -> DensePieces:
+    """Return the dense pieces in what is not labelled, or labelled as parenchyma or sinus."""
+    unlabelled = (own == 0) | of_tissues(own, *PARENCHYMA, "sinus")
+    parenchyma = shape.inside & ((own == 0) | of_tissues(own, *PARENCHYMA))
+    hidden = np.where(unlabelled, hu, -FAR_MM)
+    # Beside labelled contrast agent, voxels are as bright by partial volume.
+    beside = ndimage.maximum_filter(own == CODE["urine"], 3)
+    found = dense_pieces(hidden, parenchyma, shape.inside | shape.hollow, voxel_ml)
+    return DensePieces(found.urine, found.stone & ~(beside & found.is_enhanced), found.is_enhanced)
+
+
+def _draw(codes: np.ndarray, kidney: np.ndarray, shape: KidneyShape, spacing_mm: np.ndarray) -> np.ndarray:
+    """Draw pyramids in parenchyma of which the CT shows none, and the renal fascia; return where."""
+    rest = of_tissues(codes, "kidney") & kidney
+    goal = of_tissues(codes, "sinus", "urine") & (shape.outer_mm < 0)
+    pyramids = draw_pyramids(rest, goal, -shape.outer_mm, spacing_mm)
+    codes[rest], codes[pyramids] = CODE["cortex"], CODE["medulla"]
+    fat = of_tissues(codes, "fat") & (shape.outer_mm > 0)
+    fascia = draw_fascia(fat, of_tissues(codes, *BEHIND_FASCIA), shape.distance_mm, spacing_mm)
+    codes[fascia] = CODE["fascia"]
+    return rest | fascia
+
+
+def _write(codes: np.ndarray, masks: Mapping[str, np.ndarray]) -> None:
+    for name, where in masks.items():
+        codes[where] = CODE[name]
+
+
+def _write_labels(codes: np.ndarray, own: np.ndarray, hu: np.ndarray, spacing_mm: np.ndarray) -> None:
+    """Write labels over what was classified, but for those of a whole kidney; and the parts of tumours."""
+    labelled = (own > 0) & (own != CODE["kidney"])
+    codes[labelled] = own[labelled]
+    tumour = own == CODE["tumour"]
+    if tumour.any():
+        box = box_around(tumour, 1)
+        _write(codes[box], lesion_parts(hu[box], tumour[box], spacing_mm))
