@@ -41,6 +41,10 @@ STUDIES = {
         "studies.echo.echo_command:echo",
         "Compare the B-mode image with an independent wave simulator.",
     ),
+    "scanner": (
+        "studies.scanner.scanner_command:scanner",
+        "Send echoes of real scanners through the B-mode and Doppler chain.",
+    ),
     "resection": (
         "studies.resection.resection_command:resection",
         "Measure margins, balance, random cuts and times of the resection.",

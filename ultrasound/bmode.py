@@ -137,6 +137,10 @@ class BMode:
             self.spread(10.0 ** (probe.noise_before_gain_db / 20.0), self.plane.noise_key, False)
         else:
             self._add()
+        return self.scan_converted(probe)
+
+    def scan_converted(self, probe: Probe) -> np.ndarray:
+        """Return grey values (rows, columns) uint8 of ``decibel``, for the settings of the probe rendered last."""
         image = np.empty(self.plane.shape, np.uint8)
         self._scan_convert(probe.dyn_range_db, image)
         return image

@@ -106,14 +106,24 @@ class Doppler:
         self._make_tables(steered)
         if self.sound is not self.bmode.sound:
             self.sound.run(steered, thick=False)
-        stride = self.sound.stride_of(probe)
-        count = probe.number_of_samples_per_scanline // stride + 1
         limits = probe.velocity_limit_cm_s / 100, probe.wall_filter_cm_s / 100
+        count, gate = self._sample_volume(probe)
         self._find_flow(count, int(clamped), pulse_share(time_s), *limits)
-        gate = max(round(GATE_MM / (2 * stride * probe.sample_mm)), 0)
         # Noise changes with time, and with the plane.
         key = zlib.crc32(np.array([time_s, self.sound.plane.noise_key]).tobytes()) & 0x3FFFF
-        self._average(count, gate, noise_energy(probe), key)
+        self._average(count, gate, noise_energy(probe), float(ENSEMBLE) ** -0.5, key)
+
+    def estimate_of(self, probe: Probe, moment: np.ndarray) -> None:
+        """Compute ``mean`` from moments (scanlines, tissue samples, 3) of echoes (``autocorrelation``), which have their own noise."""
+        self._make_tables(self._steered(probe))
+        fill((self.moment, moment.astype(np.float32)))
+        self._average(*self._sample_volume(probe), 0.0, 0.0, 0)
+
+    def _sample_volume(self, probe: Probe) -> tuple[int, int]:
+        """Return the number of tissue samples of a scanline, and half of those of the sample volume."""
+        stride = self.sound.stride_of(probe)
+        gate = max(round(GATE_MM / (2 * stride * probe.sample_mm)), 0)
+        return probe.number_of_samples_per_scanline // stride + 1, gate
 
     def velocity_cm_s(self, probe: Probe) -> np.ndarray:
         """Return the velocity towards the array (scanlines, samples) [cm/s] of the last estimate, aliased."""
@@ -182,7 +192,7 @@ class Doppler:
         return -along * size / ti.max(turned.norm(), 1e-9)
 
     @ti.kernel
-    def _average(self, count: int, gate: int, noise: float, key: int):
+    def _average(self, count: int, gate: int, noise: float, scatter: float, key: int):
         for line, k in ti.ndrange(self.lines, count):
             total, half = tm.vec3(0.0), self.half[k]
             for m in range(-half, half + 1):
@@ -193,7 +203,7 @@ class Doppler:
             total /= 2.0 * gate + 1.0
             # The error of the mean of so many pulses, complex Gaussian.
             error = self.noise_at(line, k, key)
-            error *= (total.z + noise) / ti.sqrt(float(ENSEMBLE))
+            error *= (total.z + noise) * scatter
             self.mean[line, k] = tm.vec3(
                 total.x + error.x, total.y + error.y, total.z + noise + 0.5 * error.x
             )
@@ -245,6 +255,16 @@ class Doppler:
         i, j = ti.cast(x, ti.i32), ti.cast(y, ti.i32)
         low = tm.mix(self.mean[i, j], self.mean[i, j + 1], y - j)
         return tm.mix(low, tm.mix(self.mean[i + 1, j], self.mean[i + 1, j + 1], y - j), x - i)
+
+
+def autocorrelation(iq: np.ndarray) -> np.ndarray:
+    """Return the moments (.., 3) of the echoes (.., pulses) of successive pulses: real and imaginary part of the autocorrelation from
+    one pulse to the next, and the energy (Kasai et al. 1985).
+
+    Of a signal whose phase grows as the echo comes earlier, as demodulated by exp(-i w t), the phase is that of a velocity towards the array.
+    """
+    lagged = (iq[..., 1:] * iq[..., :-1].conj()).mean(axis=-1)
+    return np.stack([lagged.real, lagged.imag, (np.abs(iq) ** 2).mean(axis=-1)], axis=-1)
 
 
 def noise_energy(probe: Probe) -> float:

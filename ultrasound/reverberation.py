@@ -3,7 +3,7 @@
 Behind gas, the tissue in front of it is seen again, weaker, as sound returns from it by way of the gas (dirty shadow); bubbles ring on
 for a long time (ring-down). A clip of metal sends sound to and fro within itself (comet tail). The face of the array reflects what
 returns to it, so that strong interfaces are repeated; and its own vibration takes a while to die down (near field).
-The strengths are estimates, after images of atlases.
+The strengths are estimates, after images of atlases; the vibration in air is that of a recorded array.
 """
 
 import numpy as np
@@ -26,9 +26,12 @@ BUBBLE_SHARE, BUBBLE_MM, BUBBLE_AMPLITUDE, BUBBLE_FALL_DB_MM = 0.08, 1.5, 0.06, 
 BUBBLE_SQUARELY = 3.0
 # A clip is taken to be at least so thick [mm]; it may be thinner than the distance of tissue samples.
 LEAST_METAL_MM = 0.8
-# Vibration of the array in contact, and in air: the length in wavelengths over which it falls to 1 / e; how much stronger it is in
-# air [dB], and the thickness of its lens, between whose faces it then bands, in wavelengths.
-FALL, FALL_IN_AIR, MORE_IN_AIR_DB, LENS = 1.5, 8.0, 6.0, 6.0
+# Vibration of the array in contact, and in air: the length in wavelengths over which it falls to 1 / e; and how much stronger it is in
+# air [dB]: estimates, as no recording has both.
+FALL, MORE_IN_AIR_DB = 1.5, 6.0
+# In air, fitted to a linear array in air (PLUS's UltrasonixLinearRfData; study scanner): that length, the thickness of the lens between
+# whose faces it bands, in wavelengths, and half of the depth of these bands.
+FALL_IN_AIR, LENS, BANDS = 9.4, 5.3, 0.27
 
 
 @ti.data_oriented
@@ -120,7 +123,7 @@ def ringing(probe: Probe) -> np.ndarray:
     """Return the amplitude of the array's own vibration at each sample, in air and in contact, (2, samples) float32."""
     depth = (np.arange(probe.number_of_samples_per_scanline) + 0.5) * probe.sample_mm / probe.wavelength_mm
     start = 10 ** (probe.ringing_db / 20)
-    bands = 0.6 + 0.4 * np.cos(2 * np.pi * depth / LENS)
+    bands = 1 - BANDS + BANDS * np.cos(2 * np.pi * depth / LENS)
     in_air = 10 ** (MORE_IN_AIR_DB / 20) * np.exp(-depth / FALL_IN_AIR) * bands
     # Harmonics are not of the frequency at which the array vibrates.
     share = 0.1 if probe.harmonics else 1.0

@@ -28,7 +28,7 @@ Values = float | np.ndarray | Callable[[np.ndarray, np.ndarray], np.ndarray]
 class EchoPhantom:
     """Tissue whose properties are functions of u and v of the image plane [mm], the same across it, filled anew for each image."""
 
-    def __init__(self, probe: Probe) -> None:
+    def __init__(self, probe: Probe, pixels: int = PIXELS) -> None:
         self.probe = probe
         self.doppler: Doppler | None = None
         width, depth, above = probe.extent_mm
@@ -39,7 +39,7 @@ class EchoPhantom:
         self.u, self.v = low[:, None, None] + VOXEL_MM * np.indices(count)
         self.tissue = SampledVolume(np.zeros((*count, 1, 4)), index_from_mm, outside=0.0)
         organ = SampledVolume(np.full((1, 1, 1), -1.0), np.diag([1 / FAR_MM] * 3 + [1.0]))
-        self.plane = PlaneInTissue(Unmoved(), PIXELS)
+        self.plane = PlaneInTissue(Unmoved(), pixels)
         self.flow = SampledVolume(np.zeros((*count, 1, CHANNELS)), index_from_mm, outside=0.0)
         self.bmode = BMode(Propagation(self.tissue, organ, self.plane, probe, VOXEL_MM), probe)
 

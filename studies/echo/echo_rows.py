@@ -8,13 +8,13 @@ from tqdm import tqdm
 
 from studies.echo.echo_phantom import IMPEDANCE, EchoPhantom
 from studies.echo.simus_beam import SimusBeam, full_width, half_correlation
+from studies.image_quality import RAYLEIGH_SNR, correlation_length, speckle_snr
 from ultrasound.doppler import doppler_shift_khz
 from ultrasound.interface import Surface
 from ultrasound.probe import Probe, load_probe
 
 # Bars: share of a width or length, decibels of a level, share of a Doppler shift.
 WIDTH_BAR, LEVEL_BAR_DB, SHIFT_BAR = 0.2, 3.0, 0.05
-RAYLEIGH_SNR = float(np.sqrt(np.pi / (4 - np.pi)))
 DEPTHS_MM = {
     "drop-in": (9.0, 18.0, 30.0),
     "linear": (10.0, 24.0, 50.0),
@@ -157,9 +157,8 @@ def speckle_statistics(phantom: EchoPhantom, name: str) -> Iterator[Row]:
     depth, part = 18.0, np.abs(phantom.depth_mm - 18.0) < 2.0
     images = [phantom.amplitude(at) for at in np.random.default_rng(SEED).uniform(-200, 200, 10)]
     amplitude = np.array([image[24:-24, part] for image in images])
-    snr = float(np.mean([each.mean() / each.std() for each in amplitude]))
+    snr = float(np.mean([speckle_snr(each) for each in amplitude]))
     yield Row(f"{name}, speckle: mean over SD (Rayleigh)", snr, RAYLEIGH_SNR, "")
-    intensity = amplitude**2 - (amplitude**2).mean()
     beam, place = _beam(phantom.probe), np.linspace(-2, 2, 161)
     _, along = beam.echoes(beam.points(place, depth), depth)
     spacing = float(phantom.probe.line_spacing_mm(np.array([depth]))[0])
@@ -168,9 +167,7 @@ def speckle_statistics(phantom: EchoPhantom, name: str) -> Iterator[Row]:
         ("laterally", 1, spacing, half_correlation(along, place[1] - place[0])),
         ("axially", 2, phantom.probe.sample_mm, half_correlation(axial.T, 0.02)),
     ):
-        field = np.moveaxis(intensity, axis, 0)
-        curve = [(field[: len(field) - k] * field[k:]).mean() / (field**2).mean() for k in range(12)]
-        found = float(np.interp(-0.5, -np.array(curve), step * np.arange(12)))
+        found = step * correlation_length(amplitude, axis)
         yield Row(f"{name}, speckle to half correlation {way}", found, reference, "mm")
 
 

@@ -29,7 +29,7 @@ def pymust() -> Any:
         import pymust
     except ImportError:
         raise EchoStudyError(
-            "study echo needs the package pymust: run python -m pip install -r requirements-dev.txt"
+            "this study needs the package pymust: run python -m pip install -r requirements-dev.txt"
         ) from None
     return pymust
 

@@ -1,0 +1,55 @@
+"""Figures of ultrasound images: statistics of speckle, contrast, and grey values. NumPy."""
+
+import numpy as np
+
+# Of the amplitude of fully developed speckle: mean over SD (Wagner 1983, IEEE Trans Sonics Ultrason 30, 156).
+RAYLEIGH_SNR = float(np.sqrt(np.pi / (4 - np.pi)))
+# Bins of the histograms that gCNR compares.
+GCNR_BINS = 100
+
+
+def speckle_snr(amplitude: np.ndarray) -> float:
+    """Return mean over SD of the amplitude of a region."""
+    return float(amplitude.mean() / amplitude.std())
+
+
+def correlation_length(amplitude: np.ndarray, axis: int) -> float:
+    """Return the lag, in samples of an axis, at which the intensity of a region correlates by 1/2; nan where it never does."""
+    intensity = np.moveaxis(amplitude**2, axis, 0)
+    intensity = intensity - intensity.mean()
+    curve = [
+        np.mean(intensity[: len(intensity) - lag] * intensity[lag:]) for lag in range(len(intensity) // 2)
+    ]
+    share = np.array(curve) / curve[0]
+    if not (share < 0.5).any():
+        return float("nan")
+    below = int(np.argmax(share < 0.5))
+    return float(np.interp(-0.5, -share[below - 1 : below + 1], [below - 1, below]))
+
+
+def without_depth_trend(amplitude: np.ndarray) -> np.ndarray:
+    """Return amplitudes (scanlines, samples) divided by an exponential of depth, which attenuation and TGC leave in a region."""
+    sample = np.arange(amplitude.shape[1])
+    level = np.polyfit(sample, np.log((amplitude**2).mean(axis=0)) / 2, 1)
+    return amplitude / np.exp(np.polyval(level, sample))
+
+
+def contrast_db(inside: np.ndarray, outside: np.ndarray) -> float:
+    """Return the mean intensity of amplitudes inside a lesion over that outside [dB]."""
+    return float(10 * np.log10((inside**2).mean() / (outside**2).mean()))
+
+
+def gcnr(inside: np.ndarray, outside: np.ndarray) -> float:
+    """Return the generalized contrast-to-noise ratio of amplitudes: 1 - overlap of their distributions (Rodriguez-Molares 2020, IEEE
+    TUFFC 67, 745, equation 10). A monotonic grey map does not change it; the histograms are of logarithms, whose bins are alike.
+    """
+    logs = [np.log(np.maximum(each.ravel(), np.finfo(float).tiny)) for each in (inside, outside)]
+    edges = np.histogram_bin_edges(np.concatenate(logs), GCNR_BINS)
+    shares = [np.histogram(each, edges)[0] / each.size for each in logs]
+    return float(1 - np.minimum(*shares).sum())
+
+
+def grey_figures(image: np.ndarray) -> tuple[float, float]:
+    """Return median and 90th percentile of grey values."""
+    median, most = np.percentile(image, [50, 90])
+    return float(median), float(most)
