@@ -366,6 +366,6 @@ def scanned_anatomy(
     labels, shift = anatomy.labels, shift_by(origin)
     label_values = None if labels is None else labels.voxels.astype(np.int32)
     tumour = anatomy.tumour and translated(anatomy.tumour, -origin)
-    classify = None if labels is None else partial(tissue_voxels, anatomy, ct, draws, origin)
+    classify = None if labels is None else partial(tissue_voxels, labels, anatomy, ct, draws, origin)
     given = organ, ct.voxels, ct.index_from_mm @ shift, label_values, anatomy.tissues, tumour
     return ScannedAnatomy(*given, classify)

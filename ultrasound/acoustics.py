@@ -251,5 +251,3 @@ def _border(
         return np.zeros_like(inside)
     distance = ndimage.distance_transform_edt(~outside, sampling=spacing_mm)
     return inside & (distance <= max(thickness_mm, spacing_mm.min()) + 1e-6)
-
-

@@ -63,7 +63,9 @@ def _flow_of_texts(
     labels: np.ndarray | None, tissues: str, table: str, spacing_mm: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     tissue_of_label = {int(label): tissue for label, tissue in json.loads(tissues).items()}
-    low, values = blood_flow(np.zeros((1, 1, 1), np.uint8) if labels is None else labels, tissue_of_label, spacing_mm)
+    low, values = blood_flow(
+        np.zeros((1, 1, 1), np.uint8) if labels is None else labels, tissue_of_label, spacing_mm
+    )
     return low, values.astype(np.float16)
 
 

@@ -332,7 +332,14 @@ class BMode:
                         echo = (self.sound.echo, self.sound.capsule)[kind][n // TASK, k]
                         if echo.z > 0.0:
                             self.reflect(
-                                has_speckle, n // TASK, k, echo, stride * sample_mm, sample_mm, speckle_sd, look
+                                has_speckle,
+                                n // TASK,
+                                k,
+                                echo,
+                                stride * sample_mm,
+                                sample_mm,
+                                speckle_sd,
+                                look,
                             )
 
     @ti.func

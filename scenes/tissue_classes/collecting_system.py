@@ -28,9 +28,7 @@ class DensePieces:
     is_enhanced: bool
 
 
-def dense_pieces(
-    hu: np.ndarray, parenchyma: np.ndarray, kidney: np.ndarray, voxel_ml: float
-) -> DensePieces:
+def dense_pieces(hu: np.ndarray, parenchyma: np.ndarray, kidney: np.ndarray, voxel_ml: float) -> DensePieces:
     """Return the dense pieces of a kidney.
 
     Args:

@@ -101,9 +101,7 @@ class SurfaceGrid:
         points = self.low + SURFACE_MM * np.moveaxis(np.indices(counts), 0, -1)
         self.distance = signed_distance_from(surface, points.reshape(-1, 3)).reshape(counts)
 
-    def at_voxels(
-        self, values: np.ndarray, box: Box, index_from_mm: np.ndarray
-    ) -> np.ndarray:
+    def at_voxels(self, values: np.ndarray, box: Box, index_from_mm: np.ndarray) -> np.ndarray:
         """Return values of this grid at the voxels of a box, float32; of the nearest point outside it."""
         mm_from_index = np.linalg.inv(index_from_mm)
         to_grid = mm_from_index[:3, :3] / SURFACE_MM

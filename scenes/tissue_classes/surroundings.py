@@ -150,10 +150,7 @@ def _body(
     if level_hu < FLUID_BELOW_HU - (0 if is_enhanced else 20):
         return "soft-tissue"
     beside_spine = spine is not None and abs(at[0] - spine[0]) < BESIDE_SPINE_MM and at[1] > spine[1] - 25.0
-    if is_enhanced:
-        is_muscle = level_hu < LIVER_ABOVE_HU
-    else:
-        is_muscle = at[1] > BEHIND_MM or beside_spine
+    is_muscle = level_hu < LIVER_ABOVE_HU if is_enhanced else at[1] > BEHIND_MM or beside_spine
     if is_muscle:
         return "muscle"
     if spine is None or radius_mm < ORGAN_MM:

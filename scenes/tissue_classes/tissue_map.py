@@ -49,7 +49,7 @@ MARGIN_MM = MOST_MM + 4.0
 class TissueMap:
     """Tissue of each voxel (nx, ny, nz): ``codes`` of TISSUES from 1, uint8, on a grid that ``index_from_mm`` (4, 4) gives.
 
-    ``hu`` is on the same grid. ``drawn`` is what no CT shows.
+    ``hu`` int16 is on the same grid. ``drawn`` is what no CT shows.
     """
 
     codes: np.ndarray
@@ -60,6 +60,11 @@ class TissueMap:
     def mask(self, *tissues: str) -> np.ndarray:
         """Return whether a voxel is of one of some tissues."""
         return of_tissues(self.codes, *tissues)
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """All that it has, in the order of its fields."""
+        return self.codes, self.hu, self.drawn, self.index_from_mm
 
 
 @dataclass(frozen=True)
@@ -92,7 +97,6 @@ class KidneyShape:
 def tissue_map(
     hu: np.ndarray,
     labels: np.ndarray,
-    tissues: Mapping[int, str],
     organ: trimesh.Trimesh,
     index_from_mm: np.ndarray,
     draws: bool = True,
@@ -101,15 +105,14 @@ def tissue_map(
 
     Args:
         hu: (nx, ny, nz) [HU].
-        labels: on the same grid.
-        tissues: the tissue of each label, one of TISSUES.
+        labels: on the same grid, codes of TISSUES (``codes_of_labels``); 0 without.
         organ: its surface [mm].
         index_from_mm: (4, 4), from patient coordinates, LPS.
         draws: also what no CT shows.
     """
     spacing = np.linalg.norm(np.linalg.inv(index_from_mm[:3, :3]), axis=0)
     factors = fine_factors(spacing)
-    own = refined_labels(_codes_of(labels, tissues), factors, spacing)
+    own = refined_labels(labels, factors, spacing)
     sharp, smooth = refined(hu, factors), refined(_median(hu, spacing), factors)
     to_index = fine_index_from_mm(index_from_mm, factors)
     shape = KidneyShape.of(organ, to_index, own.shape)
@@ -129,20 +132,21 @@ def tissue_map(
         drawn[box] = _draw(codes[box], kidney, shape, place.spacing_mm)
     _write_labels(codes, own, sharp, place.spacing_mm)
     _write(codes[box], {"stone": dense.stone})
-    return TissueMap(codes, sharp, drawn & (own == 0) | drawn & (own == CODE["kidney"]), to_index)
+    drawn &= (own == 0) | (own == CODE["kidney"])
+    return TissueMap(codes, np.rint(sharp).astype(np.int16), drawn, to_index)
+
+
+def codes_of_labels(labels: np.ndarray, tissues: Mapping[int, str]) -> np.ndarray:
+    """Return labels as codes of TISSUES, uint8, 0 where a label has no tissue."""
+    table = np.zeros(max(int(labels.max()), *tissues, 0) + 1, np.uint8)
+    for value, tissue in tissues.items():
+        table[value] = CODE[tissue]
+    return table[labels.astype(np.intp)]
 
 
 def of_tissues(codes: np.ndarray, *tissues: str) -> np.ndarray:
     """Return whether codes are of one of some tissues."""
     return np.isin(codes, [CODE[name] for name in tissues])
-
-
-def _codes_of(labels: np.ndarray, tissues: Mapping[int, str]) -> np.ndarray:
-    """Return labels as codes of TISSUES, 0 where a label has no tissue."""
-    table = np.zeros(max(int(labels.max()), *tissues, 0) + 1, np.uint8)
-    for value, tissue in tissues.items():
-        table[value] = CODE[tissue]
-    return table[labels.astype(np.intp)]
 
 
 def _median(hu: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
@@ -196,3 +200,10 @@ def _write_labels(codes: np.ndarray, own: np.ndarray, hu: np.ndarray, spacing_mm
     if tumour.any():
         box = box_around(tumour, 1)
         _write(codes[box], lesion_parts(hu[box], tumour[box], spacing_mm))
+
+
+def tissue_arrays(
+    hu: np.ndarray, labels: np.ndarray, organ: trimesh.Trimesh, index_from_mm: np.ndarray, draws: int
+) -> tuple[np.ndarray, ...]:
+    """Return the arrays of ``tissue_map``, for a cache."""
+    return tissue_map(hu, labels, organ, index_from_mm, bool(draws)).arrays
