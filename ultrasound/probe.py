@@ -30,7 +30,7 @@ DOPPLER_MODES: tuple[DopplerMode, ...] = get_args(DopplerMode)
 
 # Grey values: the exponent of the share of the dynamic range. On a scanner's screen most of the tissue is dark.
 GreyMap = Literal["linear", "dark"]
-GREY_EXPONENTS: dict[GreyMap, float] = {"linear": 1.0, "dark": 3.0}
+GREY_EXPONENTS: dict[GreyMap, float] = {"linear": 1.0, "dark": 3.5}
 # How much weaker harmonics are, where they have built up; and the depth at which they have half of that amplitude. An estimate.
 HARMONIC_LOSS_DB, BUILD_UP_MM = 15.0, 12.0
 # Range of the angles of spatial compounding.
