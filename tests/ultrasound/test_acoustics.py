@@ -223,10 +223,9 @@ def test_every_tissue_has_sane_values(tissue):
     keys = {"impedance_mrayl", "attenuation_db_cm_mhz", "backscatter_db", "texture_db", "texture_mm"}
     assert set(table) - {"anisotropy_db", "follows_hu"} == keys and 0 <= table.get("anisotropy_db", 0) < 6
     # From fat to cortical bone, or titanium, from water to what nothing passes; and no echo above all of the sound.
-    assert (
-        (0.0 if tissue == "gas" else 1.3) < table["impedance_mrayl"] < (28.0 if tissue == "metal" else 8.0)
-        and 0 < table["attenuation_db_cm_mhz"] <= 12.0
-    )
+    assert (0.0 if tissue == "gas" else 1.3) < table["impedance_mrayl"] < (
+        28.0 if tissue == "metal" else 8.0
+    ) and 0 < table["attenuation_db_cm_mhz"] <= 12.0
     assert -70.0 < table["backscatter_db"] < -10.0 - CORTEX_DB
     assert 0 <= table["texture_db"] < 6.0 and 0.5 <= table["texture_mm"] <= 5.0
 
@@ -298,7 +297,9 @@ def test_what_is_denser_in_the_ct_scatters_more_and_the_mean_stays(tissue):
 
 def test_a_few_decibels_are_the_most_that_hu_make():
     found = variation(stripes(20, 800.0))
-    assert found[[10, 30, 50, 70], 10, 10] == pytest.approx(MOST_OF_HU_DB * np.array([-1, 1, -1, 1]), abs=1e-4)
+    assert found[[10, 30, 50, 70], 10, 10] == pytest.approx(
+        MOST_OF_HU_DB * np.array([-1, 1, -1, 1]), abs=1e-4
+    )
     assert 2.0 <= np.abs(found).max() <= MOST_OF_HU_DB + 1e-4 <= 4.0
 
 
