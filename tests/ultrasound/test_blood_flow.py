@@ -110,7 +110,7 @@ def test_the_necrotic_part_of_a_tumour_has_no_flow():
 
 
 def test_no_flow_without_vessels_and_kidney():
-    low, values = blood_flow(np.zeros(SHAPE, np.uint8), {}, SPACING)
+    _, values = blood_flow(np.zeros(SHAPE, np.uint8), {}, SPACING)
     assert values.shape[-1] == CHANNELS and (values == 0).all()
     index_from_mm = np.diag([*(1 / SPACING), 1.0])
     for labels in (None, np.zeros(SHAPE, np.uint8)):
