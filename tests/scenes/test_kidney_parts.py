@@ -9,7 +9,7 @@ from scenes.tissue_classes.kidney_parts import (
     ENHANCED_VESSEL_SHARE,
     FAT_BELOW_HU,
     SINUS_SHARE,
-    VESSEL_ABOVE_HU,
+    VESSEL_BELOW_MEDIAN_HU,
     cortex_and_medulla_hu,
     kidney_parts,
 )
@@ -139,7 +139,9 @@ def test_what_takes_up_no_contrast_agent_deep_in_a_kidney_is_no_parenchyma(off, 
     assert (parts_of(hu)["sinus"] == (HOLLOW | calyx if is_sinus else HOLLOW)).all()
 
 
-@pytest.mark.parametrize("level, border", [(35.0, VESSEL_ABOVE_HU), (180.0, ENHANCED_VESSEL_SHARE * 180.0)])
+@pytest.mark.parametrize(
+    "level, border", [(35.0, 35.0 - VESSEL_BELOW_MEDIAN_HU), (180.0, ENHANCED_VESSEL_SHARE * 180.0)]
+)
 def test_in_the_hollow_what_is_as_bright_as_blood_is_a_vessel(level, border):
     vessel = HOLLOW & (np.hypot(AT[..., 0], AT[..., 1]) < 3.0)
     hu = np.where(PARENCHYMA, level, FAT_HU)
