@@ -67,7 +67,7 @@ def surroundings(
         vessel[near] &= ~beside
         masks["vessel"] = vessel
     masks["bowel"] = masks["bowel"] | agent
-    return masks | {"bone": bone, "metal": hu > METAL_ABOVE_HU}
+    return masks | {"bone": bone}
 
 
 def _oral_agent(hu: np.ndarray, bone: np.ndarray, place: Place) -> np.ndarray:

@@ -21,9 +21,9 @@ PLAIN = {
 }
 ENHANCED = PLAIN | {"muscle": 65, "liver": 115, "spleen": 125, "kidney": 185, "vessel": 180}
 BONE, MARROW, BOWEL = 600, 170, 40
-LEFT, RIGHT = np.array([58.0, 32.0, 0.0]), np.array([-58.0, 32.0, -6.0])
+LEFT, RIGHT = np.array([68.0, 26.0, 0.0]), np.array([-68.0, 26.0, -6.0])
 HALF_AXES = np.array([25.0, 20.0, 46.0])
-LOW, HIGH = np.array([-150.0, -100.0, -75.0]), np.array([150.0, 115.0, 75.0])
+LOW, HIGH = np.array([-174.0, -117.0, -72.0]), np.array([174.0, 117.0, 72.0])
 NOISE_HU = 8.0
 
 
@@ -49,20 +49,17 @@ def _column(at: np.ndarray, x: float, y: float, radius: float) -> np.ndarray:
 def structures(at: np.ndarray) -> np.ndarray:
     """The name of the structure at each of some places (.., 3) [mm]."""
     truth = np.full(at.shape[:-1], "air", dtype="U12")
-    body = np.hypot(at[..., 0] / 140, at[..., 1] / 100)
+    body = np.hypot(at[..., 0] / 165, at[..., 1] / 110)
     masks = [
         ("fat", body < 1),
-        ("muscle", (body < 0.93) & (body > 0.83)),
+        ("muscle", (body < 0.94) & (body > 0.8)),
         ("muscle", _column(at, 36, 78, 17) | _column(at, -36, 78, 17)),
-        (
-            "muscle",
-            _column(at, 38, 40, 14) & (at[..., 0] < 40) | _column(at, -38, 40, 14) & (at[..., 0] > -40),
-        ),
+        ("muscle", _column(at, 36, 48, 16) | _column(at, -36, 48, 16)),
         ("bone", _column(at, 0, 50, 21)),
         ("marrow", _column(at, 0, 50, 18)),
         ("vessel", _column(at, 12, 16, 10) | _column(at, -15, 17, 11)),
-        ("liver", _ellipsoid(at, (-62, -28, 10), (48, 40, 60))),
-        ("spleen", _ellipsoid(at, (97, 10, 15), (16, 30, 42))),
+        ("liver", _ellipsoid(at, (-74, -32, 10), (52, 40, 60))),
+        ("spleen", _ellipsoid(at, (108, -12, 15), (17, 30, 42))),
         ("bowel", _ellipsoid(at, (35, -48, -10), (24, 22, 40))),
         ("gas", _ellipsoid(at, (35, -52, -10), (15, 12, 32))),
         ("kidney", _ellipsoid(at, LEFT, HALF_AXES) | _ellipsoid(at, RIGHT, HALF_AXES)),
@@ -75,7 +72,7 @@ def structures(at: np.ndarray) -> np.ndarray:
 def abdomen(
     side: str = "left",
     enhanced: bool = True,
-    spacing=(2.0, 2.0, 3.0),
+    spacing=(3.0, 3.0, 4.0),
     axes=(0, 1, 2),
     mirrored=(False, False, False),
 ) -> Abdomen:
