@@ -2,6 +2,7 @@
 
 import numpy as np
 from scipy import ndimage
+from skimage.measure import block_reduce
 
 # Cortical bone; what only bone reaches; the least volume of that which is no stone or calcified vessel.
 SHELL_ABOVE_HU, BONE_ABOVE_HU, MIN_BONE_ML = 250.0, 350.0, 0.4
@@ -15,7 +16,7 @@ def bones(hu: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
     if not (hu > BONE_ABOVE_HU).any():
         return np.zeros(hu.shape, bool)
     # The maximum of each block, as cortical bone may be thinner than a block.
-    coarse = ndimage.maximum_filter(hu, size=tuple(step))[:: step[0], :: step[1], :: step[2]]
+    coarse = block_reduce(hu, tuple(step), np.max, cval=hu.min())
     shell = _large_parts(coarse, float(np.prod(spacing_mm * step)))
     # A bone cut by the CT's border is continued beyond it as its mirror image.
     beyond = [min(n, int(BEYOND_MM / (s * k))) for n, s, k in zip(shell.shape, spacing_mm, step, strict=True)]

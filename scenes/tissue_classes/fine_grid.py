@@ -64,11 +64,12 @@ def refined_labels(labels: np.ndarray, factors: np.ndarray, spacing_mm: np.ndarr
 
 
 def signed_distance_of(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return distances [mm] (nx, ny, nz) from the border of a mask, half a voxel off its voxels' centres; negative inside."""
-    half = float(np.mean(spacing_mm)) / 2
+    """Return distances [mm] (nx, ny, nz) from the voxels of a mask less those from the voxels outside; negative inside.
+
+    Linear between neighbours, it is 0 halfway between a voxel inside and one outside, however long voxels are along an axis.
+    """
     outside = ndimage.distance_transform_edt(~mask, sampling=spacing_mm)
-    inside = ndimage.distance_transform_edt(mask, sampling=spacing_mm)
-    return np.where(mask, half - inside, outside - half).astype(np.float32)
+    return (outside - ndimage.distance_transform_edt(mask, sampling=spacing_mm)).astype(np.float32)
 
 
 def coarse_distance(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:

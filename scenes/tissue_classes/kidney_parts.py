@@ -18,8 +18,10 @@ FAT_BELOW_HU = -20.0
 # In the hollow of a kidney, what is nearly as bright as parenchyma is a vessel or the pelvis: without contrast agent, so much darker at most,
 # as fat in the same voxels makes more of a difference; with it, so much of its HU at least.
 VESSEL_BELOW_MEDIAN_HU, ENHANCED_VESSEL_SHARE = 10.0, 0.6
-# In a kidney with contrast agent, what has less than this share of the parenchyma's HU is sinus or a calyx without.
+# In a kidney with contrast agent, what has less than this share of the parenchyma's HU, or of its medulla's, is sinus or a calyx without.
 SINUS_SHARE = 0.5
+# Parenchyma is brighter than this, with or without contrast agent; urine without is darker.
+PARENCHYMA_ABOVE_HU = 30.0
 
 
 def median_hu(hu: np.ndarray, parenchyma: np.ndarray) -> float:
@@ -44,24 +46,26 @@ def kidney_parts(
     vessel = hollow & (
         hu > (ENHANCED_VESSEL_SHARE * median if is_enhanced else median - VESSEL_BELOW_MEDIAN_HU)
     )
-    sinus = (hollow & ~vessel) | (deep & (hu < FAT_BELOW_HU))
-    if is_enhanced:
-        sinus |= deep & (hu < SINUS_SHARE * median)
+    levels = cortex_and_medulla_hu(hu, parenchyma, depth_mm) if is_enhanced else None
+    darkest = median if levels is None else levels[1]
+    sinus = (hollow & ~vessel) | (deep & (hu < (SINUS_SHARE * darkest if is_enhanced else FAT_BELOW_HU)))
     rest = parenchyma & ~sinus
     masks = {"sinus": sinus, "vessel": vessel}
-    border = border_of_cortex(hu, rest, depth_mm) if is_enhanced else None
-    if border is None:
+    if levels is None:
         return masks | {"kidney": rest}
-    medulla = ndimage.binary_opening(rest & (hu < border) & (depth_mm > OUTER_MM[0]))
+    medulla = ndimage.binary_opening(rest & (hu < np.mean(levels)) & (depth_mm > OUTER_MM[0]))
     return masks | {"medulla": medulla, "cortex": rest & ~medulla}
 
 
-def border_of_cortex(hu: np.ndarray, parenchyma: np.ndarray, depth_mm: np.ndarray) -> float | None:
-    """Return the HU between cortex and medulla; None where the phase does not tell them apart."""
+def cortex_and_medulla_hu(
+    hu: np.ndarray, parenchyma: np.ndarray, depth_mm: np.ndarray
+) -> tuple[float, float] | None:
+    """Return the HU of cortex and medulla; None where the phase does not tell them apart."""
+    parenchyma = parenchyma & (hu > PARENCHYMA_ABOVE_HU)
     outer, inner = (
         hu[parenchyma & (depth_mm > low) & (depth_mm < high)] for low, high in (OUTER_MM, INNER_MM)
     )
     if min(len(outer), len(inner)) < LEAST_VOXELS:
         return None
     cortex, medulla = float(np.median(outer)), float(np.percentile(inner, 25))
-    return (cortex + medulla) / 2 if cortex - medulla > CORTEX_ABOVE_MEDULLA_HU else None
+    return (cortex, medulla) if cortex - medulla > CORTEX_ABOVE_MEDULLA_HU else None

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 from skimage.feature import peak_local_max
+from skimage.measure import block_reduce
 from skimage.segmentation import watershed
 
 GAS_BELOW_HU, FAT_BELOW_HU, METAL_ABOVE_HU = -300.0, -30.0, 2500.0
@@ -66,7 +67,7 @@ def surroundings(
         vessel[near] &= ~beside
         masks["vessel"] = vessel
     masks["bowel"] = masks["bowel"] | agent
-    return masks | {"bone": bone, "metal": hu > METAL_ABOVE_HU}
+    return masks | {"bone": bone}
 
 
 def _oral_agent(hu: np.ndarray, bone: np.ndarray, place: Place) -> np.ndarray:
@@ -124,7 +125,7 @@ def _near(mask: np.ndarray, distance_mm: float, spacing_mm: np.ndarray) -> np.nd
     if not mask.any():
         return mask
     step = np.maximum(np.rint(CELL_MM / spacing_mm), 1).astype(int)
-    coarse = ndimage.maximum_filter(mask, tuple(step))[:: step[0], :: step[1], :: step[2]]
+    coarse = block_reduce(mask, tuple(step), np.max)
     near = ndimage.distance_transform_edt(~coarse, sampling=spacing_mm * step) <= distance_mm
     return _repeated(near, step, mask.shape)
 
@@ -138,19 +139,18 @@ def _bodies(hu: np.ndarray, soft: np.ndarray, bone: np.ndarray, place: Place) ->
     """Return liver, spleen and muscle: soft tissue in large bodies."""
     step = np.maximum(np.rint(CELL_MM / place.spacing_mm), 1).astype(int)
     cell_mm = place.spacing_mm * step
-    every = tuple(slice(None, None, k) for k in step)
-    mean, inside = ndimage.uniform_filter(hu, tuple(step))[every], soft[every]
+    mean, inside = block_reduce(hu, tuple(step), np.mean), block_reduce(soft, tuple(step), np.mean) >= 0.5
     depth = ndimage.gaussian_filter(ndimage.distance_transform_edt(inside, sampling=cell_mm), 1.0)
     peaks = peak_local_max(depth, min_distance=3, threshold_abs=BODY_MM, exclude_border=False)
     seeds = np.zeros(inside.shape, np.int32)
     seeds[tuple(peaks.T)] = np.arange(1, len(peaks) + 1)
     basins = watershed(-depth, seeds, mask=inside)
-    spine = _spine(bone[every], step, place)
+    spine = _spine(block_reduce(bone, tuple(step), np.mean) >= 0.5, step, place)
     names = ["soft-tissue"]
     for n, peak in enumerate(peaks, 1):
         own = basins == n
         level = float(np.median(mean[own & (depth > depth[own].max() / 3)]))
-        at = place.of_indices(np.argwhere(own).mean(axis=0)[None] * step)[0]
+        at = place.of_indices(_middle(own, step))[0]
         names.append(_body(level, float(depth[tuple(peak)]), at, spine, place.is_enhanced))
     found = np.array([("muscle", "liver", "spleen").index(n) + 1 if n != "soft-tissue" else 0 for n in names])
     codes = _repeated(found[basins].astype(np.uint8), step, soft.shape)
@@ -163,7 +163,12 @@ def _spine(bone: np.ndarray, step: np.ndarray, place: Place) -> np.ndarray | Non
     if count == 0:
         return None
     largest = parts == 1 + np.argmax(np.bincount(parts.ravel())[1:])
-    return place.of_indices(np.argwhere(largest).mean(axis=0)[None] * step)[0]
+    return place.of_indices(_middle(largest, step))[0]
+
+
+def _middle(cells: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Return the index (1, 3) of the voxel, fractional, in the middle of a mask of cells."""
+    return (np.argwhere(cells).mean(axis=0)[None] + 0.5) * step - 0.5
 
 
 def _body(

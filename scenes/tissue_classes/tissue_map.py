@@ -28,7 +28,7 @@ from scenes.tissue_classes.fine_grid import (
 )
 from scenes.tissue_classes.kidney_parts import kidney_parts
 from scenes.tissue_classes.lesion_parts import lesion_parts
-from scenes.tissue_classes.surroundings import Place, surroundings
+from scenes.tissue_classes.surroundings import METAL_ABOVE_HU, Place, surroundings
 
 # In the order of their codes.
 TISSUES = (
@@ -137,6 +137,8 @@ def tissue_map(
     inside = np.zeros(own.shape, bool)
     inside[box] = shape.inside
     _write(codes, surroundings(smooth, inside, bone & ~inside, box, place))
+    # A clip is thinner than what a median leaves.
+    _write(codes, {"metal": (sharp > METAL_ABOVE_HU) & ~inside})
     drawn = np.zeros(own.shape, bool)
     kidney = shape.inside & np.isin(own[box], [0, CODE["kidney"]])
     _write(codes[box], kidney_parts(smooth[box], kidney, shape.hollow, -shape.outer_mm))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ultrasound.acoustics import TissueVoxels
 from ultrasound.blood_flow import (
     BEAT_S,
     CHANNELS,
@@ -14,8 +15,7 @@ from ultrasound.blood_flow import (
 )
 
 SPACING, SHAPE, RADIUS = np.array([0.8, 0.8, 0.8]), (90, 40, 40), 3.0
-TISSUES = {1: "kidney", 2: "artery", 3: "vein"}
-PLAIN, ENHANCED = 40.0, 200.0
+TISSUES = {1: "kidney", 2: "artery", 3: "vein", 4: "vessel", 5: "necrosis", 6: "tumour"}
 
 
 def drawn(value: int, bend: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -27,9 +27,9 @@ def drawn(value: int, bend: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     return labels, off
 
 
-def flow_of(labels: np.ndarray, hu: float | np.ndarray = PLAIN, tissues=None) -> np.ndarray:
+def flow_of(labels: np.ndarray, tissues=None) -> np.ndarray:
     """Flow on the whole grid."""
-    low, values = blood_flow(np.broadcast_to(np.float32(hu), SHAPE), labels, tissues or TISSUES, SPACING)
+    low, values = blood_flow(labels, tissues or TISSUES, SPACING)
     whole = np.zeros((*SHAPE, CHANNELS), np.float32)
     whole[tuple(slice(a, a + n) for a, n in zip(low, values.shape, strict=False))] = values
     return whole
@@ -73,17 +73,20 @@ def test_flow_follows_a_bent_vessel():
         assert here[1] / here[0] == pytest.approx(0.4 * np.cos(x[i] / 10), abs=0.12)
 
 
-def test_an_enhanced_vessel_without_a_label_is_of_the_kind_of_its_neighbour():
+def test_a_vessel_of_unknown_kind_is_of_the_kind_of_its_labelled_neighbour():
     labels, off = drawn(3)
     x = SPACING[0] * np.indices(SHAPE)[0]
-    hu = np.where((labels > 0) | (off < RADIUS), ENHANCED, PLAIN)
-    labels = np.where((labels == 3) & (x < 36.0), 0, labels)
-    flow = flow_of(labels, hu)
+    labels = np.where((labels == 3) & (x < 36.0), 4, labels)
+    flow = flow_of(labels)
     middle = (off < 1.0) & (x > 16.0) & (x < 32.0)
     assert (flow[middle, 0] < -0.05).all()
+    # Of the others, those farther than 25 mm from a labelled one keep the table's values of an unknown kind.
+    unknown = np.float32(flow_table()["vessel"]["resistive_index"])
+    assert (flow[(off < 1.0) & (x < 10.0), 3] == unknown).all()
+    assert (flow[(off < 1.0) & (x > 12.0) & (x < 32.0), 3] != unknown).all()
     # Without any labelled vessel, its kind is unknown.
-    flow = flow_of(np.where(labels == 3, 1, labels), hu)
-    assert (flow[middle, 3] == np.float32(flow_table()["vessel"]["resistive_index"])).all()
+    flow = flow_of(np.where(labels == 3, 1, labels))
+    assert (flow[middle, 3] == unknown).all()
 
 
 def test_small_vessels_of_the_parenchyma_run_outward():
@@ -102,19 +105,27 @@ def test_small_vessels_of_the_parenchyma_run_outward():
 def test_the_necrotic_part_of_a_tumour_has_no_flow():
     x = SPACING[:, None, None, None] * np.indices(SHAPE) - np.array([36.0, 16.0, 16.0])[:, None, None, None]
     radius = np.linalg.norm(x, axis=0)
-    hu = np.where(radius < 8.0, 20.0, 110.0)
-    flow = flow_of((radius < 14.0).astype(int), hu, {1: "tumour"})
-    assert (flow[radius < 7.5] == 0).all() and (flow[(radius > 8.5) & (radius < 13.5), 4] > 0).all()
+    flow = flow_of(np.select([radius < 8.0, radius < 14.0], [5, 6], 0))
+    assert (flow[radius < 8.0] == 0).all() and (flow[(radius >= 8.0) & (radius < 14.0), 4] > 0).all()
 
 
-def test_no_flow_without_vessels_and_kidney(monkeypatch):
-    low, values = blood_flow(np.zeros(SHAPE, np.float32), None, {}, SPACING)
+def test_no_flow_without_vessels_and_kidney():
+    _, values = blood_flow(np.zeros(SHAPE, np.uint8), {}, SPACING)
     assert values.shape[-1] == CHANNELS and (values == 0).all()
+    index_from_mm = np.diag([*(1 / SPACING), 1.0])
+    for labels in (None, np.zeros(SHAPE, np.uint8)):
+        _, values = stored_flow(TissueVoxels(np.zeros(SHAPE, np.int16), labels, TISSUES, index_from_mm))
+        assert (values == 0).all()
+
+
+def test_stored_flow_is_the_flow_whatever_the_hu(monkeypatch):
     monkeypatch.setattr("sim.stored_arrays.FOLDER", None)
     labels, _ = drawn(2)
-    again = stored_flow(np.full(SHAPE, PLAIN, np.float32), labels, TISSUES, SPACING)
-    low, values = blood_flow(np.full(SHAPE, PLAIN, np.float32), labels, TISSUES, SPACING)
-    assert (again[0] == low).all() and again[1] == pytest.approx(values, abs=1e-3)
+    low, values = blood_flow(labels, TISSUES, SPACING)
+    index_from_mm = np.diag([*(1 / SPACING), 1.0])
+    for hu in (40, 200):
+        again = stored_flow(TissueVoxels(np.full(SHAPE, hu, np.int16), labels, TISSUES, index_from_mm))
+        assert (again[0] == low).all() and again[1] == pytest.approx(values, abs=1e-3)
 
 
 def test_the_pulse_rises_to_systole_and_falls_until_the_next_beat():

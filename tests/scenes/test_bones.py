@@ -1,4 +1,4 @@
-"""Tissues that no label tells: bone with its marrow, blood with contrast agent."""
+"""Bones with their marrow, by HU and shape."""
 
 from itertools import permutations
 
@@ -6,18 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from scenes.patients import import_warnings
-from ultrasound.acoustics import (
-    ATTENUATION,
-    IMPEDANCE,
-    STONE_ABOVE_MEDIAN_HU,
-    _filled,
-    bones,
-    classify_tissues,
-    enclosed,
-    properties,
-    tissue_table,
-)
+from scenes.tissue_classes.bones import _filled, bones
 
 SPACING = np.array([0.9, 0.9, 0.9])
 FAT, MARROW, SHELL, CORTEX, BLOOD = -100.0, 150.0, 600.0, 180.0, 200.0
@@ -62,28 +51,6 @@ def test_a_bone_is_found_at_any_voxel_size(spacing):
     assert found[away < 14.0].mean() > 0.99 and not found[away > 16.0 + 2 * 1.8 * np.sqrt(3)].any()
 
 
-def test_what_has_a_label_is_no_bone():
-    hu, bone, kidney, _ = abdomen()
-    muscle = bone & (np.arange(70)[:, None] < 34)
-    found = classify_tissues(hu, {"kidney": kidney, "muscle": muscle}, SPACING)["bone"]
-    assert not (found & muscle).any() and found[bone & ~muscle].mean() > 0.9
-
-
-@pytest.mark.parametrize("across, down", list(permutations(range(3), 2)))
-@pytest.mark.parametrize("width, closed", [(17.0, True), (23.0, False)])
-def test_a_groove_is_a_hollow_where_no_ball_of_20_mm_goes_in(across, down, width, closed):
-    spacing = np.array([1.0, 2.0, 0.5])
-    places = np.moveaxis(np.indices((60 / spacing).astype(int) + 1), 0, -1) * spacing - 30.0
-    groove = (np.abs(places[..., across]) < width / 2) & (places[..., down] > -20.0)
-    found = enclosed(~groove, spacing)
-    assert not (found & ~groove).any()
-    # Amid the groove: at a width of 17 mm a ball on its open end reaches 5 mm in, and where one goes in it touches the walls.
-    along = np.delete(places, [across, down], -1)[..., 0]
-    deep = (np.abs(places[..., across]) < width / 2 - 2.0) & (np.abs(along) < 5.0)
-    deep &= (places[..., down] > -5.0) & (places[..., down] < 20.0)
-    assert found[deep].all() if closed else not found[deep].any()
-
-
 def test_a_bone_in_the_cts_corner_of_which_no_cut_shows_a_whole_ring_is_filled_too():
     hu = np.full((80, 70, 60), FAT, np.float32)
     hu[ball((0.0, 0.0, 0.0), 25.0)] = SHELL
@@ -115,32 +82,9 @@ def test_all_sections_are_filled_as_each_alone(axis, share):
     assert np.array_equal(_filled(solid, axis), np.moveaxis(np.stack(each), 0, axis))
 
 
-def test_what_is_bright_by_contrast_agent_is_no_bone_and_outside_the_labels_blood():
-    hu, bone, kidney, vessel = abdomen()
-    found = classify_tissues(hu, {"kidney": kidney}, SPACING)
-    assert not (found["bone"] & (kidney | vessel)).any()
-    assert (found["vessel"] & vessel).sum() > 0.6 * vessel.sum()
-    assert not (found["vessel"] & (kidney | bone)).any()
-
-
-def test_without_contrast_agent_nothing_is_taken_for_blood():
-    hu, _, kidney, _ = abdomen()
-    hu[kidney] -= CORTEX - 30.0
-    assert "vessel" not in classify_tissues(hu, {"kidney": kidney}, SPACING)
-
-
-def test_contrast_agent_in_labelled_urine_and_about_it_is_no_stone_but_without_agent_what_is_bright_there_is():
-    hu, _, kidney, _ = abdomen()
-    urine, agent = ball((50.0, 30.0, 27.0), 4.0), ball((50.0, 30.0, 27.0), 4.5)
-    hu[agent] = CORTEX + STONE_ABOVE_MEDIAN_HU + 100.0
-    named = {"kidney": kidney & ~urine, "urine": urine}
-    assert not classify_tissues(hu, named, SPACING)["stone"].any()
-    assert (classify_tissues(hu, {"kidney": kidney}, SPACING)["stone"] == agent).all()
-    assert (classify_tissues(hu - CORTEX + 30.0, named, SPACING)["stone"] == agent).all()
-
-
-def test_an_import_warns_of_what_is_classified_as_stone():
-    assert import_warnings.STONE_ABOVE_MEDIAN_HU == STONE_ABOVE_MEDIAN_HU
+def test_what_is_bright_by_contrast_agent_is_no_bone():
+    hu, _, kidney, vessel = abdomen()
+    assert not (bones(hu, SPACING) & (kidney | vessel)).any()
 
 
 def test_a_bright_speck_is_no_bone():
@@ -149,11 +93,3 @@ def test_a_bright_speck_is_no_bone():
     assert not bones(hu, SPACING).any()
     hu[ball((30.0, 30.0, 27.0), 7.0)] = 900.0
     assert bones(hu, SPACING).any()
-
-
-def test_marrow_takes_the_sound_that_bone_takes():
-    hu, _, _, _ = abdomen()
-    values = properties(hu, spacing_mm=SPACING)[4, 33, 30]
-    table = tissue_table()["bone"]
-    assert abs(values[IMPEDANCE] - table["impedance_mrayl"]) < 0.01
-    assert abs(values[ATTENUATION] - table["attenuation_db_cm_mhz"]) < 0.01

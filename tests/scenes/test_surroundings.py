@@ -1,0 +1,164 @@
+"""Tissues around a kidney, on a made abdomen: by phase, side, and however the CT's axes are stored."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+import trimesh
+from made_abdomen import Abdomen, abdomen, as_before
+from scipy import ndimage
+from skimage.measure import marching_cubes
+
+from scenes.tissue_classes.tissue_map import CODE, TissueMap, tissue_map
+
+OF_MUSCLE = "muscle", "perimysium"
+
+
+@cache
+def made(*given) -> tuple[Abdomen, TissueMap]:
+    body = abdomen(*given)
+    return body, tissue_map(body.hu, body.labels, body.organ, body.index_from_mm)
+
+
+def recall(body: Abdomen, found: TissueMap, structure: str, *tissues: str, where=None) -> float:
+    """The share of a structure's voxels that have one of some tissues."""
+    mask = body.truth == structure if where is None else (body.truth == structure) & where
+    factors = np.array(found.codes.shape) // mask.shape
+    for axis, factor in enumerate(factors):
+        mask = mask.repeat(factor, axis)
+    return float(found.mask(*tissues)[mask].mean())
+
+
+def away_from_wall(body: Abdomen) -> np.ndarray:
+    index = np.moveaxis(np.indices(body.truth.shape), 0, -1)
+    at = (index - body.index_from_mm[:3, 3]) @ np.linalg.inv(body.index_from_mm[:3, :3]).T
+    return np.hypot(at[..., 0] / 165, at[..., 1] / 110) < 0.79
+
+
+SIDES = [("left", True), ("left", False), ("right", True), ("right", False)]
+
+
+@pytest.mark.parametrize("side, enhanced", SIDES)
+def test_fat_gas_bone_and_bowel_are_known_by_their_hu(side, enhanced):
+    body, found = made(side, enhanced)
+    # Of sharp edges blurred over a voxel of 3 mm, up to half a voxel on either side is of the other side.
+    for structure, tissues, least in (
+        ("bone", ("bone",), 0.95),
+        ("marrow", ("bone",), 0.95),
+        ("gas", ("gas",), 0.9),
+        ("fat", ("fat", "fascia"), 0.9),
+        ("bowel", ("bowel",), 0.7),
+    ):
+        assert recall(body, found, structure, *tissues) > least, structure
+    assert recall(body, found, "air", "gas") > 0.95
+
+
+@pytest.mark.parametrize("side, enhanced", SIDES)
+def test_the_liver_is_beside_the_right_kidney_and_the_spleen_beside_the_left(side, enhanced):
+    body, found = made(side, enhanced)
+    organ, other = ("spleen", "liver") if side == "left" else ("liver", "spleen")
+    assert recall(body, found, organ, organ) > 0.9
+    assert not found.mask(other).any()
+
+
+@pytest.mark.parametrize("side, enhanced", SIDES)
+def test_muscle_beside_the_spine_is_muscle_in_every_phase(side, enhanced):
+    body, found = made(side, enhanced)
+    assert recall(body, found, "muscle", *OF_MUSCLE, where=away_from_wall(body)) > 0.9
+    for organ in ("liver", "spleen"):
+        assert recall(body, found, organ, *OF_MUSCLE) < 0.02
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_with_contrast_agent_the_wall_of_the_abdomen_is_muscle_too(side):
+    body, found = made(side, True)
+    # What is nearer to the ball in liver or spleen than to one in muscle is of their body.
+    assert recall(body, found, "muscle", *OF_MUSCLE, where=~away_from_wall(body)) > 0.7
+
+
+@pytest.mark.parametrize("side, enhanced", SIDES)
+def test_blood_is_known_by_contrast_agent_alone(side, enhanced):
+    body, found = made(side, enhanced)
+    if enhanced:
+        assert recall(body, found, "vessel", "vessel") > 0.6
+    else:
+        assert not found.mask("vessel").any()
+
+
+@pytest.mark.parametrize("side, enhanced", SIDES)
+def test_parenchyma_is_within_the_surface_and_nothing_of_the_surroundings_in_it(side, enhanced):
+    body, found = made(side, enhanced)
+    index = np.moveaxis(np.indices(found.codes.shape), 0, -1)
+    at = (index - found.index_from_mm[:3, 3]) @ np.linalg.inv(found.index_from_mm[:3, :3]).T
+    away = np.linalg.norm((at - body.organ.center_mass) / (np.ptp(body.organ.vertices, axis=0) / 2), axis=-1)
+    parenchyma = found.mask("kidney", "cortex", "medulla")
+    # The surface's grid of 2 mm is right to 0.1 mm about an ellipsoid of 20 mm or more: half a percent of its size.
+    assert parenchyma[away < 0.98].all() and not parenchyma[away > 1.02].any()
+    # Between kidney and fat no film of another tissue: it would be an interface of its own. What touches the other organs is left out.
+    shell = (away > 1.02) & (away < 1.1)
+    assert found.mask("soft-tissue")[shell].mean() < 0.1
+
+
+def turned(axes, mirrored) -> tuple[np.ndarray, np.ndarray]:
+    """Codes of the abdomen from a CT stored otherwise, as if it were not; and where they are drawn."""
+    body = abdomen("left", True, axes=axes, mirrored=mirrored)
+    found = tissue_map(body.hu, body.labels, body.organ, body.index_from_mm, draws=False)
+    return as_before(found.codes, axes, mirrored)
+
+
+@pytest.mark.parametrize(
+    "axes, mirrored",
+    [((0, 1, 2), (True, True, False)), ((2, 0, 1), (False, True, True)), ((1, 0, 2), (True, False, False))],
+)
+def test_tissues_do_not_depend_on_how_the_axes_are_stored(axes, mirrored):
+    body, _ = made("left", True)
+    usual = tissue_map(body.hu, body.labels, body.organ, body.index_from_mm, draws=False).codes
+    other = turned(axes, mirrored)
+    # The surface's distances are rounded otherwise, and bodies of equal depth may meet elsewhere.
+    assert (other == usual).mean() > 0.998
+    for tissue in ("muscle", "spleen", "bone", "bowel", "vessel", "kidney"):
+        one, two = usual == CODE[tissue], other == CODE[tissue]
+        assert 2 * (one & two).sum() > 0.99 * (one.sum() + two.sum()), tissue
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_thick_slices_have_the_same_tissues(side):
+    body = abdomen(side, True, (2.5, 2.5, 6.0))
+    found = tissue_map(body.hu, body.labels, body.organ, body.index_from_mm)
+    assert (np.linalg.norm(np.linalg.inv(found.index_from_mm[:3, :3]), axis=0) <= 1.6).all()
+    organ = "spleen" if side == "left" else "liver"
+    assert recall(body, found, organ, organ) > 0.9
+    assert recall(body, found, "muscle", *OF_MUSCLE, where=away_from_wall(body)) > 0.9
+    assert recall(body, found, "bone", "bone") > 0.9 and recall(body, found, "fat", "fat", "fascia") > 0.9
+
+
+@pytest.mark.parametrize("kidney, organ", [(1, "spleen"), (2, "liver")])
+def test_on_a_real_unenhanced_ct_nearly_all_of_liver_and_spleen_are_found(data, kidney, organ):
+    """Against TotalSegmentator's organs; what else is taken for them has no bar."""
+    folder = data / "ct" / "totalseg"
+    images = [folder / "ct.nii.gz", folder / "kidneys.nii.gz", folder / "organs" / f"{organ}.nii.gz"]
+    if not all(path.is_file() for path in images):
+        pytest.skip("no TotalSegmentator test CT in ../shared/data")
+    ct, kidneys, truth = (sitk.ReadImage(str(path)) for path in images)
+    voxels = [sitk.GetArrayFromImage(each).transpose(2, 1, 0) for each in (ct, kidneys)]
+    mm_from_index = np.eye(4)
+    mm_from_index[:3, :3] = np.array(ct.GetDirection()).reshape(3, 3) * ct.GetSpacing()
+    mm_from_index[:3, 3] = ct.GetOrigin()
+    mask = ndimage.gaussian_filter((voxels[1] == kidney).astype(float), 0.8)
+    vertices, faces, _, _ = marching_cubes(mask, 0.5)
+    surface = trimesh.Trimesh(vertices @ mm_from_index[:3, :3].T + mm_from_index[:3, 3], faces)
+    trimesh.repair.fix_normals(surface)
+    labels = np.where(voxels[1] == kidney, CODE["kidney"], 0).astype(np.uint8)
+    found = tissue_map(voxels[0], labels, surface, np.linalg.inv(mm_from_index))
+    # Of each voxel of the organ, those of the finer grid.
+    own = (
+        sitk.GetArrayFromImage(sitk.Resample(truth, ct, interpolator=sitk.sitkNearestNeighbor)).transpose(
+            2, 1, 0
+        )
+        > 0
+    )
+    factors = np.array(found.codes.shape) // own.shape
+    for axis, factor in enumerate(factors):
+        own = own.repeat(factor, axis)
+    assert own.sum() > 1000 and found.mask(organ)[own].mean() > 0.9
