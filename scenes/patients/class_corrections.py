@@ -51,7 +51,7 @@ def corrections_of(
     changed = (stated > 0) & (stated != found.codes)
     for axis, factor in enumerate(fine_factors(grid.spacing)):
         own = own.repeat(factor, axis)
-    taken = changed & _may_be(stated, own)
+    taken = changed & _may_be(stated, own, found.codes)
     texts = {
         "corrected by the class image": _changes(found.codes, stated, taken, fine),
         "not taken from the class image, as the labels say where kidney, tumours, cysts and other labelled tissues are": (
@@ -79,10 +79,14 @@ def _stated(classes: Sequence[LabelMap], fine: VoxelGrid, found: np.ndarray) -> 
     return stated
 
 
-def _may_be(stated: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Return whether what a class image says counts, where the labels say ``own``."""
-    in_kidney = (own == CODE["kidney"]) & of_tissues(stated, *PARTS_OF_KIDNEY)
-    return in_kidney | ((own == 0) & ~of_tissues(stated, *OF_LABELS, *WITHIN_KIDNEY))
+def _may_be(stated: np.ndarray, own: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """Return whether what a class image says counts, where the labels say ``own``: the kidney's surface leaves out some of its voxels."""
+    kidney = own == CODE["kidney"]
+    within = kidney & of_tissues(found, "kidney", *PARTS_OF_KIDNEY)
+    beside = ((own == 0) | kidney) & ~within
+    return (within & of_tissues(stated, *PARTS_OF_KIDNEY)) | (
+        beside & ~of_tissues(stated, *OF_LABELS, *WITHIN_KIDNEY)
+    )
 
 
 def _changes(found: np.ndarray, stated: np.ndarray, where: np.ndarray, grid: VoxelGrid) -> list[str]:

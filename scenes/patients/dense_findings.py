@@ -9,6 +9,7 @@ from scenes.patients.organ_selection import closing
 from scenes.tissue_classes.collecting_system import DENSE_ABOVE_HU, LARGEST_STONE_ML
 from scenes.tissue_classes.kidney_parts import ENHANCED_FROM_HU, median_hu
 from scenes.tissue_classes.tissue_map import (
+    CODE,
     PARENCHYMA,
     codes_of_labels,
     dense_pieces_of_kidney,
@@ -45,10 +46,12 @@ def dense_findings(
     if _has_dense(hu, parenchyma | of_tissues(own, "sinus"), level_hu + DENSE_ABOVE_HU, grid.spacing):
         found, index_from_mm = dense_pieces_of_kidney(hu, own, organ, grid.index_from_mm)
         fine = VoxelGrid.of_transform(index_from_mm, found.urine.shape)
-        undecided = np.ones(found.urine.shape, bool)
+        corrected = np.zeros(found.urine.shape, bool)
         if corrections is not None:
-            undecided = fine.sampled(corrections, sitk.sitkNearestNeighbor, 0).transpose(2, 1, 0) == 0
-        urine, stone = found.urine & undecided, found.stone & undecided
+            corrected = _sampled(corrections, fine)
+        labelled = _sampled(grid.image((own == CODE["urine"]).transpose(2, 1, 0).astype(np.uint8)), fine)
+        urine = _without_touching(found.urine, labelled) & ~corrected
+        stone = found.stone & ~corrected
         is_enhanced, agent_ml = found.is_enhanced, float(urine.sum() * fine.voxel_ml)
         kidney = f"kidney {level_hu:.0f} HU: {'enhanced' if is_enhanced else 'unenhanced'}"
         agent = (
@@ -84,6 +87,18 @@ def _has_dense(hu: np.ndarray, kidney: np.ndarray, above_hu: float, spacing_mm: 
         dense.any()
         and (dense & ndimage.binary_dilation(closing(kidney[box], spacing_mm), iterations=2)).any()
     )
+
+
+def _sampled(image: sitk.Image, grid: VoxelGrid) -> np.ndarray:
+    """Return whether an image's voxel is not 0 at those of another grid (nx, ny, nz)."""
+    return grid.sampled(image, sitk.sitkNearestNeighbor, 0).transpose(2, 1, 0) > 0
+
+
+def _without_touching(mask: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the pieces of a mask that do not touch another: the rim of labelled contrast agent is as bright by partial volume."""
+    pieces, _ = ndimage.label(mask, np.ones((3, 3, 3)))
+    touching = np.unique(pieces[ndimage.binary_dilation(other, np.ones((3, 3, 3)))])
+    return mask & ~np.isin(pieces, touching)
 
 
 def _largest_piece(grid: VoxelGrid, mask: np.ndarray, organ: trimesh.Trimesh) -> str:

@@ -147,8 +147,8 @@ def dense_pieces_of_kidney(
     shape = KidneyShape.of(organ, to_index, own.shape)
     box = shape.box
     found = _dense(refined(hu, factors)[box], own[box], shape, float(np.prod(spacing / factors)) / 1000)
-    # Other labels than the whole kidney's are written over contrast agent.
-    shown = replace(found, urine=found.urine & np.isin(own[box], [0, CODE["kidney"]]))
+    # Stones, and other labels than the whole kidney's, are written over contrast agent.
+    shown = replace(found, urine=found.urine & ~found.stone & np.isin(own[box], [0, CODE["kidney"]]))
     to_index[:3, 3] -= [a.start for a in box]
     return shown, to_index
 
