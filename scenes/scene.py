@@ -197,7 +197,7 @@ class Image(Section):
     ``contact`` "tissue", where the CT shows anything but gas. ``outside`` "fluid": a layer of irrigation fluid of ``fluid_gap_mm``
     covers the organ, through which elements are in contact too; in front of it is gas. Water stays on a surface up to a height of 1.4
     times its capillary length, which is 2.7 mm. With ``atlas``, what the CT cannot show is drawn from an atlas: pyramids without
-    enhancement, the renal fascia.
+    enhancement, the renal fascia, layers in muscle.
     """
 
     mode: Literal["ct", "b-mode", "both"] = "both"

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import SimpleITK as sitk
 import trimesh
+from scipy import ndimage
 
 from scenes.patients.organ_selection import VESSELS
 from scenes.patients.readers.label_maps import LESIONS, LabelMap, listed, resample_nearest
@@ -66,16 +67,24 @@ def corrections_of(
 
 
 def _stated(classes: Sequence[LabelMap], fine: VoxelGrid, found: np.ndarray) -> np.ndarray:
-    """Return what class images say (nx, ny, nz), as codes of TISSUES; 0 where they say nothing, or what was drawn.
+    """Return what class images say (nx, ny, nz), as codes of TISSUES; 0 where they say nothing.
 
-    Where several layers of a file say something, what differs from ``found`` counts.
+    Where several layers of a file say something, what differs from ``found`` counts. What was drawn is of the tissue that it was drawn in.
     """
-    stated = np.zeros(found.shape, np.uint8)
+    stated, drawn = np.zeros(found.shape, np.uint8), np.zeros(found.shape, bool)
     for one in classes:
         known = {v: s.tissue for v, s in one.segments.items() if s.tissue and not is_drawn(s.name)}
-        codes = codes_of_labels(resample_nearest(one.grid, one.values, fine).transpose(2, 1, 0), known)
+        values = resample_nearest(one.grid, one.values, fine).transpose(2, 1, 0)
+        drawn |= np.isin(values, [v for v, s in one.segments.items() if is_drawn(s.name)])
+        codes = codes_of_labels(values, known)
         counts = (codes > 0) & ((stated == 0) | (codes != found))
         stated[counts] = codes[counts]
+    for tissue in np.unique(found[drawn & (stated == 0)]):
+        of_tissue = (stated > 0) & (found == tissue)
+        if (stated[of_tissue] != tissue).any():
+            nearest = ndimage.distance_transform_edt(~of_tissue, fine.spacing, False, True)
+            lines = drawn & (stated == 0) & (found == tissue)
+            stated[lines] = stated[tuple(nearest[:, lines])]
     return stated
 
 

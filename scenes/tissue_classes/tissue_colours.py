@@ -7,6 +7,7 @@ COLOURS = {
     "fascia": "#ffffff",
     "soft-tissue": "#e0b8a8",
     "muscle": "#a63a33",
+    "perimysium": "#f0a8c0",
     "liver": "#7a3b1e",
     "spleen": "#7b3f72",
     "bowel": "#c8834a",

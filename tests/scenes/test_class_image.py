@@ -7,19 +7,22 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from skimage.color import rgb2lab
-from synthetic_body import LEFT, TUMOUR, coarsely, level
+from synthetic_body import LEFT, TUMOUR, coarsely, points_of
+from test_dense_findings import ENHANCED_HU, KIDNEY, THIN, made, organ
 from test_field_cases import SPINE, inside, scan, slicer, written
 
 from app import main
 from scenes.import_findings import read_findings
+from scenes.patients.class_corrections import corrections_of
 from scenes.patients.import_command import TISSUE_OPTIONS
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_merge import MERGE_ORDER
 from scenes.patients.readers.segment_names import TISSUE_OF_NAME, is_derived, tissue_of
 from scenes.scene import load_scene
 from scenes.tissue_classes.class_image import CLASS_IMAGE_FILE, DRAWN, DRAWN_NAME, class_image
+from scenes.tissue_classes.corrections import with_corrections
 from scenes.tissue_classes.tissue_colours import COLOURS, rgb_of
-from scenes.tissue_classes.tissue_map import CODE, TISSUES, TissueMap
+from scenes.tissue_classes.tissue_map import CODE, TISSUES, TissueMap, codes_of_labels, tissue_map
 from ultrasound.acoustics import tissue_table
 
 # Voxels that a class image divides along two axes.
@@ -190,6 +193,7 @@ def test_a_corrected_segment_comes_back_and_nothing_else_changes(files, first, t
     assert all((again / name).read_bytes() == (patient / name).read_bytes() for name in same)
     notes = read_findings(again).notes
     (note,) = [each for each in notes if each.startswith("corrected")]
+    assert "muscle" not in note
     ml = float((voxels_of(path) != wanted).sum() * np.prod(sitk.ReadImage(str(path)).GetSpacing()) / 1000)
     assert f"bone is spleen ({ml:.1f} ml)" in note
     assert any("drawn from an atlas: cortex, " in each for each in notes)
@@ -227,7 +231,7 @@ def test_a_class_image_may_be_cropped_and_have_layers_and_other_values(files, fi
     _, path = first
     image = sitk.ReadImage(str(path))
     voxels = voxels_of(path)
-    painted = (level_of(image, SPINE) < 0) & (voxels == CODE["bone"])
+    painted = inside(image, SPINE) & (voxels == CODE["bone"])
     first_layer = np.where(voxels == CODE["fat"], 77, voxels).astype(np.uint8)
     layers = sitk.JoinSeries(
         [
@@ -252,12 +256,6 @@ def test_a_class_image_may_be_cropped_and_have_layers_and_other_values(files, fi
     assert np.array_equal(voxels_of(classes_of(again, tmp_path / "out")), wanted)
 
 
-def level_of(image, solid):
-    from synthetic_body import points_of
-
-    return level(points_of(image), solid)
-
-
 def with_information(new, image):
     new.CopyInformation(image)
     return new
@@ -267,3 +265,29 @@ def test_a_class_image_alone_is_no_organ(files, first, tmp_path, capsys):
     assert main(["import", str(files[0]), str(first[1]), "--out", str(tmp_path / "a")]) == 2
     told = capsys.readouterr().err
     assert told.count("\n") == 1 and "class image alone" in told and "give the kidney's labels" in told
+
+
+def test_what_was_drawn_in_a_corrected_tissue_is_corrected_with_it(tmp_path):
+    """Layers in a muscle that is a liver: 3D Slicer shows them as a segment of their own, which nobody needs to paint over."""
+    grid, hu, coded = made(THIN, ENHANCED_HU, [])
+    hu[points_of(grid.image(coded))[..., 1] > KIDNEY[0][1] + KIDNEY[1][1] + 6] = 60.0
+    own = codes_of_labels(coded.transpose(2, 1, 0), {1: "kidney"})
+    ct = np.ascontiguousarray(hu.transpose(2, 1, 0), np.float32)
+    drawn, bare = (tissue_map(ct, own, organ(), grid.index_from_mm, draws) for draws in (True, False))
+    assert (drawn.mask("perimysium") & drawn.drawn).sum() > 1000
+    sitk.WriteImage(class_image(drawn), str(tmp_path / "a.seg.nrrd"))
+
+    def change(voxels, image):
+        voxels[voxels == CODE["muscle"]] = CODE["liver"]
+
+    changed(tmp_path / "a.seg.nrrd", tmp_path / "b.seg.nrrd", change)
+    classes = open_labels(tmp_path / "b.seg.nrrd").maps(grid)
+    corrections, _ = corrections_of(grid, hu, coded, {1: "kidney"}, organ(), classes)
+    found = sitk.GetArrayFromImage(corrections).transpose(2, 1, 0)
+    assert np.array_equal(found == CODE["liver"], bare.mask("muscle")) and set(np.unique(found)) == {
+        0,
+        CODE["liver"],
+    }
+    again = with_corrections(drawn, found, drawn.index_from_mm, {CODE["liver"]: "liver"})
+    assert not again.mask("perimysium", "muscle").any()
+    assert np.array_equal(again.drawn, drawn.drawn & ~drawn.mask("perimysium"))
