@@ -23,6 +23,8 @@ WITHIN_KIDNEY = ("cortex", "medulla", "arcuate")
 PARTS_OF_KIDNEY = (*WITHIN_KIDNEY, "sinus", "urine", "stone", *VESSELS)
 # What is labelled, and not corrected.
 OF_LABELS = ("kidney", *LESIONS, "pseudocapsule")
+# Segments of what was drawn as thin sheets in another tissue.
+DRAWN_SHEETS = tuple(tissue + DRAWN_NAME for tissue in ("fascia", "perimysium"))
 LEAST_ML = 0.05
 
 
@@ -69,21 +71,21 @@ def corrections_of(
 def _stated(classes: Sequence[LabelMap], fine: VoxelGrid, found: np.ndarray) -> np.ndarray:
     """Return what class images say (nx, ny, nz), as codes of TISSUES; 0 where they say nothing.
 
-    Where several layers of a file say something, what differs from ``found`` counts. What was drawn is of the tissue that it was drawn in.
+    Where several layers of a file say something, what differs from ``found`` counts. Sheets are of the tissue that they were drawn in.
     """
-    stated, drawn = np.zeros(found.shape, np.uint8), np.zeros(found.shape, bool)
+    stated, sheets = np.zeros(found.shape, np.uint8), np.zeros(found.shape, bool)
     for one in classes:
         known = {v: s.tissue for v, s in one.segments.items() if s.tissue and not is_drawn(s.name)}
         values = resample_nearest(one.grid, one.values, fine).transpose(2, 1, 0)
-        drawn |= np.isin(values, [v for v, s in one.segments.items() if is_drawn(s.name)])
+        sheets |= np.isin(values, [v for v, s in one.segments.items() if s.name in DRAWN_SHEETS])
         codes = codes_of_labels(values, known)
         counts = (codes > 0) & ((stated == 0) | (codes != found))
         stated[counts] = codes[counts]
-    for tissue in np.unique(found[drawn & (stated == 0)]):
+    for tissue in np.unique(found[sheets & (stated == 0)]):
         of_tissue = (stated > 0) & (found == tissue)
         if (stated[of_tissue] != tissue).any():
             nearest = ndimage.distance_transform_edt(~of_tissue, fine.spacing, False, True)
-            lines = drawn & (stated == 0) & (found == tissue)
+            lines = sheets & (stated == 0) & (found == tissue)
             stated[lines] = stated[tuple(nearest[:, lines])]
     return stated
 
