@@ -42,7 +42,7 @@ class PoseScans:
         out: Path,
     ) -> None:
         self.probe, self.settings, self.out = probe, settings, out
-        scanned = scanned_anatomy(anatomy.organ, ct, anatomy, np.zeros(3))
+        scanned = scanned_anatomy(anatomy.organ, ct, anatomy, np.zeros(3), settings.atlas)
         # Through the organ alone sound enters as in a rehearsal, perhaps through fluid.
         wet = contact == "organ" and settings.outside == "fluid"
         outside, gap_mm = (

@@ -80,7 +80,9 @@ class Rehearsal(PressedOrgan):
         scanned, acoustics = None, None
         if anatomy.ct is not None:
             origin = anatomy.organ.bounds.mean(axis=0)
-            scanned = scanned_anatomy(translated(anatomy.organ, -origin), anatomy.ct, anatomy, origin)
+            scanned = scanned_anatomy(
+                translated(anatomy.organ, -origin), anatomy.ct, anatomy, origin, scene.image.atlas
+            )
             acoustics = start_acoustics(scanned) if needs_b_mode else None
         progress("Building the model: tissue and contacts")
         super().__init__(scene, anatomy, probe)
@@ -357,11 +359,11 @@ def shift_by(origin: np.ndarray) -> np.ndarray:
 
 
 def scanned_anatomy(
-    organ: trimesh.Trimesh, ct: Grid, anatomy: LoadedAnatomy, origin: np.ndarray, draws: bool = True
+    organ: trimesh.Trimesh, ct: Grid, anatomy: LoadedAnatomy, origin: np.ndarray, draws: bool
 ) -> ScannedAnatomy:
     """The anatomy as the scanner needs it, relative to an origin; the organ is already moved there.
 
-    ``draws``: also what no CT shows.
+    ``draws``: also what no CT shows, as ``image.atlas`` of a scene says.
     """
     labels, shift = anatomy.labels, shift_by(origin)
     label_values = None if labels is None else labels.voxels.astype(np.int32)

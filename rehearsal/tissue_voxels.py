@@ -3,9 +3,10 @@
 import numpy as np
 
 from scenes.anatomy import Grid, LoadedAnatomy
+from scenes.tissue_classes.corrections import with_corrections
 from scenes.tissue_classes.tissue_map import CODE, TissueMap, codes_of_labels, tissue_arrays
 from sim.stored_arrays import stored
-from ultrasound.acoustics import TissueVoxels
+from ultrasound.acoustics import TissueVoxels, check_tissues
 
 
 def tissue_voxels(
@@ -23,6 +24,11 @@ def tissue_voxels(
 
 
 def stored_tissue_map(labels: Grid, anatomy: LoadedAnatomy, ct: Grid, draws: bool) -> TissueMap:
-    """As ``tissue_map``, but computed only once for the same anatomy."""
+    """As ``tissue_map``, but computed only once for the same anatomy, and with its corrections. Raises TissueError."""
+    check_tissues(anatomy.tissues | anatomy.corrected_tissues)
     codes = codes_of_labels(labels.voxels, anatomy.tissues)
-    return TissueMap(*stored(tissue_arrays, ct.voxels, codes, anatomy.organ, ct.index_from_mm, int(draws)))
+    found = TissueMap(*stored(tissue_arrays, ct.voxels, codes, anatomy.organ, ct.index_from_mm, int(draws)))
+    own = anatomy.corrections
+    if own is None:
+        return found
+    return with_corrections(found, own.voxels, own.index_from_mm, anatomy.corrected_tissues)

@@ -45,6 +45,9 @@ class LoadedAnatomy:
     """The tissue of each label value."""
     parts: dict[str, trimesh.Trimesh] = field(default_factory=dict)
     """Surfaces of cysts, vessels and collecting system, by tissue."""
+    corrections: Grid | None = None
+    corrected_tissues: dict[int, str] = field(default_factory=dict)
+    """The tissue of each value of the corrections."""
 
 
 def load_anatomy(scene: Scene, folder: Path, progress: ReportProgress = no_progress) -> LoadedAnatomy:
@@ -58,6 +61,8 @@ def load_anatomy(scene: Scene, folder: Path, progress: ReportProgress = no_progr
         labels=_labels(folder, anatomy),
         tissues={int(label): tissue for label, tissue in anatomy.tissues.items()},
         parts={tissue: load_surface(folder / file) for tissue, file in anatomy.parts.items()},
+        corrections=_grid(folder, anatomy.corrections) if anatomy.corrections else None,
+        corrected_tissues={int(value): tissue for value, tissue in anatomy.corrected_tissues.items()},
     )
 
 
@@ -74,7 +79,8 @@ def fingerprint(anatomy: LoadedAnatomy) -> str:
     digest = hashlib.sha256()
     parts = [anatomy.parts[name] for name in sorted(anatomy.parts)]
     arrays: tuple[np.ndarray, ...]
-    for each in (anatomy.organ, anatomy.tumour, *parts, anatomy.ct, anatomy.labels, *anatomy.shapes):
+    volumes = anatomy.ct, anatomy.labels, *([anatomy.corrections] if anatomy.corrections else [])
+    for each in (anatomy.organ, anatomy.tumour, *parts, *volumes, *anatomy.shapes):
         if isinstance(each, trimesh.Trimesh):
             arrays = each.vertices, each.faces
         elif isinstance(each, Grid):
@@ -114,12 +120,7 @@ def _grid(folder: Path, name: str) -> Grid:
     if not path.is_file():
         raise SceneError(f"{path}: no such file; check the scene")
     volume = file_volume(path)
-    mm_from_index = np.eye(4)
-    mm_from_index[:3, :3] = volume.grid.direction * volume.grid.spacing
-    mm_from_index[:3, 3] = volume.grid.origin
-    return Grid(
-        np.ascontiguousarray(volume.read().transpose(2, 1, 0), np.float32), np.linalg.inv(mm_from_index)
-    )
+    return Grid(np.ascontiguousarray(volume.read().transpose(2, 1, 0), np.float32), volume.grid.index_from_mm)
 
 
 def _labels(folder: Path, anatomy: AnatomyFiles) -> Grid | None:

@@ -35,6 +35,7 @@ OPTIONS = {
     "transducer.probe": "--probe",
     "image.mode": "--picture",
     "image.detail_level": "--detail-level",
+    "image.atlas": "--atlas",
 }
 
 
@@ -45,11 +46,15 @@ class SceneError(UserError):
     """A scene that cannot be used."""
 
 
+LabelValue = Annotated[str, Field(pattern=r"^[1-9]\d*$")]
+
+
 class AnatomyFiles(Section):
     """The embedded patient, or files in the scene's folder; without a CT there is no image.
 
     ``parts`` are further surfaces in the organ, by tissue. ``tissues`` maps each value of ``labels`` to a tissue of
-    ``ultrasound/acoustic_tissues.toml``.
+    ``ultrasound/acoustic_tissues.toml``; ``corrected_tissues`` those of ``corrections``, a volume on any grid, 0 where the tissue is as
+    labelled or classified.
     """
 
     phantom: bool = False
@@ -58,7 +63,9 @@ class AnatomyFiles(Section):
     parts: dict[Literal["sinus", "vessel", "urine", "cyst"], str] = Field(default_factory=dict)
     ct: str | None = None
     labels: str | None = None
-    tissues: dict[Annotated[str, Field(pattern=r"^[1-9]\d*$")], str] = Field(default_factory=dict)
+    tissues: dict[LabelValue, str] = Field(default_factory=dict)
+    corrections: str | None = None
+    corrected_tissues: dict[LabelValue, str] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _one_patient(self) -> "AnatomyFiles":
@@ -189,7 +196,8 @@ class Image(Section):
     The default depth is the probe's. An element is in contact where the organ is closer to the array than ``contact_gap_mm``; with
     ``contact`` "tissue", where the CT shows anything but gas. ``outside`` "fluid": a layer of irrigation fluid of ``fluid_gap_mm``
     covers the organ, through which elements are in contact too; in front of it is gas. Water stays on a surface up to a height of 1.4
-    times its capillary length, which is 2.7 mm.
+    times its capillary length, which is 2.7 mm. With ``atlas``, what the CT cannot show is drawn from an atlas: pyramids without
+    enhancement, the renal fascia, layers in muscle.
     """
 
     mode: Literal["ct", "b-mode", "both"] = "both"
@@ -204,6 +212,7 @@ class Image(Section):
     contact: Literal["organ", "tissue"] = "organ"
     contact_gap_mm: float = Field(1.5, ge=0, le=20)
     fluid_gap_mm: float = Field(4.0, ge=0, le=5)
+    atlas: bool = True
 
     @model_validator(mode="after")
     def _fluid_is_on_the_organ(self) -> "Image":

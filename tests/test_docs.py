@@ -142,7 +142,7 @@ def _path(group: click.Group) -> list[str]:
 
 
 def options(command: click.Command) -> set[str]:
-    return {name for each in command.params for name in each.opts} | {"--help", "-h"}
+    return {name for each in command.params for name in (*each.opts, *each.secondary_opts)} | {"--help", "-h"}
 
 
 def test_command_lines_are_valid():

@@ -261,6 +261,8 @@ class ImageOptions(CommandOptions):
     """B-mode, CT or both [the scene's]."""
     detail_level: Annotated[DetailLevel | None, "--detail-level"] = None
     """Detail level (realism) of the B-mode image [the scene's]."""
+    atlas: Annotated[bool | None, "--atlas/--no-atlas"] = None
+    """Draw from an atlas what the CT cannot show: pyramids without enhancement, the renal fascia, layers in muscle [the scene's]."""
 
 
 class QualityOptions(CommandOptions):

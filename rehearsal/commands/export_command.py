@@ -8,11 +8,13 @@ import trimesh
 
 from rehearsal.commands.command_line import ARGUMENT, CommandOptions, command, echo_import_warnings
 from rehearsal.result_files import counted
+from rehearsal.tissue_voxels import stored_tissue_map
 from scenes.anatomy import LoadedAnatomy, files_of, load_anatomy
 from scenes.atomic_files import check_folder, new_folder
 from scenes.patients.part_surfaces import PARTS
 from scenes.scene import Scene, load_scene, scene_file
 from scenes.surfaces import FORMATS, save_surface
+from scenes.tissue_classes.class_image import CLASS_IMAGE_FILE, class_image
 from scenes.volumes.volume_files import file_volume, save_image
 
 
@@ -31,6 +33,8 @@ def export(asked: ExportOptions) -> None:
     """Write surfaces, CT and labels of SCENE as files.
 
     SCENE is a scene file or a patient's folder. Surfaces become STL or PLY, CT and label map NRRD.
+    classes.seg.nrrd, for 3D Slicer, is the tissue of every voxel, as labelled, classified and drawn;
+    corrected there, it is given to import beside the labels.
     All is in mm, in the patient's LPS, at rest; rehearse writes the deformed surfaces.
     """
     path, out, suffix = scene_file(asked.scene), asked.out, asked.suffix
@@ -42,7 +46,7 @@ def export(asked: ExportOptions) -> None:
     with new_folder(out) as partial:
         for name, surface in named.items():
             save_surface(surface, partial / f"{name}.{suffix}")
-        volumes = save_volumes(loaded, path.parent, partial)
+        volumes = [*save_volumes(loaded, path.parent, partial), *save_classes(loaded, anatomy, partial)]
     click.echo(
         f"Wrote to {out}, in mm, LPS: {', '.join([*(f'{name}.{suffix}' for name in named), *volumes])}"
     )
@@ -71,3 +75,12 @@ def save_volumes(scene: Scene, folder: Path, out: Path) -> list[str]:
     for name, file in written.items():
         save_image(file_volume(folder / file).image(), out / name)
     return list(written)
+
+
+def save_classes(scene: Scene, anatomy: LoadedAnatomy, out: Path) -> list[str]:
+    """Write the tissue of every voxel as a segmentation of 3D Slicer; return the names of the files, none without labels. Raises OSError."""
+    if anatomy.ct is None or anatomy.labels is None:
+        return []
+    found = stored_tissue_map(anatomy.labels, anatomy, anatomy.ct, scene.image.atlas)
+    save_image(class_image(found), out / CLASS_IMAGE_FILE)
+    return [CLASS_IMAGE_FILE]

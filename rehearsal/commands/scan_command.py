@@ -102,6 +102,7 @@ def scan(asked: ScanOptions) -> None:
         version=VERSION,
         probe=scan_probe.model_dump(by_alias=True),
         detail_level=settings.detail_level,
+        atlas=settings.atlas,
         contact=asked.contact,
         contact_gap_mm=scans.scanner.contact_gap_mm,
         doppler=asked.doppler,

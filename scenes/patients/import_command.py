@@ -26,6 +26,7 @@ TISSUE_OPTIONS = {
     "arteries": "artery",
     "veins": "vein",
     "collecting": "urine",
+    "stones": "stone",
 }
 LABEL = "Names or values of the labels"
 # The file of a probe of the user's own, in the patient's folder.
@@ -46,6 +47,7 @@ PROBE_FILE = "probe.toml"
 @click.option("--arteries", help=f"{LABEL} of arteries [by name].")
 @click.option("--veins", help=f"{LABEL} of veins [by name].")
 @click.option("--collecting", help=f"{LABEL} of the collecting system [by name].")
+@click.option("--stones", help=f"{LABEL} of stones [by name].")
 @click.option("--side", type=click.Choice(["left", "right"]), help="Which kidney, where there are both.")
 @click.option("--series", help="Number of the CT series, or the end of its uid [the best guess].")
 @click.option(

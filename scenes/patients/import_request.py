@@ -74,9 +74,17 @@ def import_request(
         contents = None if ct.is_file() and is_volume_file(ct) else read_dicom_headers(ct, progress)
         words = [*organ, *chain(*tissues.values())]
         segmentations = _segmentations(ct, contents, labels, series, words, progress, space)
+        assumed = any(each.space for each in segmentations)
+        of_classes = [each for each in segmentations if each.is_class_image]
+        segmentations = [each for each in segmentations if not each.is_class_image]
+        if not segmentations:
+            raise PatientError(
+                "the labels are a class image alone, which corrects tissues and has no organ; give the kidney's labels beside it"
+            )
         volume = volume_of_labels(ct, segmentations, series, progress, contents, space)
         of_organ = organ_labels(segmentations, volume, organ, tissues)
-        assumed = any([volume.space, *(each.space for each in segmentations)])
+        classes = [one for each in of_classes for one in each.maps(volume.grid)]
+        assumed = assumed or volume.space is not None
     elif labels or organ or tissues:
         raise PatientError(
             "--seed segments the organ where there are no labels: give it, or labels, not both"
@@ -84,7 +92,7 @@ def import_request(
     else:
         volume = open_ct(ct, series, progress=progress, space=space)
         assumed = volume.space is not None
-        of_organ = OrganLabels(draft_segmentation(volume, seed_mm))
+        of_organ, classes = OrganLabels(draft_segmentation(volume, seed_mm)), []
     if space is not None and not assumed:
         raise PatientError(
             f"--space {space}: every file states where its axes point; leave --space out, or correct the file that states it wrongly"
@@ -99,6 +107,7 @@ def import_request(
         drawn=of_organ.drawn,
         position=position,
         progress=progress,
+        classes=classes,
     )
     return replace(
         patient,

@@ -19,8 +19,6 @@ REACH, LEAST_WITHIN, LEAST_BESIDE_ML = 2, 0.5, 0.5
 # What is larger than this share of the organ is around it, as its fascia.
 MOST_WITHIN = 0.5
 MOST_PLACES = 100_000
-# Above this ``ultrasound.acoustics`` takes parenchyma for stone; less volume gives no warning.
-STONE_ABOVE_MEDIAN_HU, LEAST_STONE_ML = 130.0, 0.1
 
 
 def fat_warnings(
@@ -43,38 +41,6 @@ def fat_warnings(
         f"{share:.0%} of the organ's rim is fat or gas in the CT; the labels may be shifted, mirrored or of another CT; "
         "compare the outlines in check.png",
     )
-
-
-def stone_warnings(
-    grid: VoxelGrid, hounsfield: np.ndarray, parenchyma: np.ndarray, urine: np.ndarray
-) -> tuple[str, ...]:
-    """A warning where the B-mode image will show stones in parenchyma (z, y, x): excreted contrast agent is as bright as stone.
-
-    Voxels labelled as urine, and their neighbours, do not count: of an enhanced kidney they are not taken for stone.
-    """
-    if not parenchyma.any():
-        return ()
-    bright = hounsfield > np.median(hounsfield[parenchyma]) + STONE_ABOVE_MEDIAN_HU
-    bright &= parenchyma & ~ndimage.binary_dilation(urine)
-    found_ml, share = float(bright.sum() * grid.voxel_ml), bright.sum() / parenchyma.sum()
-    if found_ml < LEAST_STONE_ML:
-        return ()
-    return (
-        f"{found_ml:.1f} ml inside the organ ({share:.1%} of it) are as bright as stone or contrast agent, {_largest_piece(grid, bright, parenchyma)}; "
-        "in the B-mode image they are bright and cast shadows; if they are contrast agent, label where it is (--collecting, --vessels), or use a CT of "
-        "the portal-venous or nephrographic phase",
-    )
-
-
-def _largest_piece(grid: VoxelGrid, bright: np.ndarray, organ: np.ndarray) -> str:
-    """Where the largest connected piece of some voxels (z, y, x) of an organ is, in words."""
-    pieces, _ = ndimage.label(bright, np.ones((3, 3, 3)))
-    piece = pieces == np.bincount(pieces[bright]).argmax()
-    places, heights = (grid.place(np.argwhere(voxels)[:, ::-1]) for voxels in (piece, organ))
-    x, y, z = places.mean(axis=0)
-    low, high = heights[:, 2].min(), heights[:, 2].max()
-    third = ("lower", "middle", "upper")[min(int(3 * (z - low) / max(high - low, 1e-9)), 2)]
-    return f"the largest piece {piece.sum() * grid.voxel_ml:.1f} ml in the {third} third, at {x:.0f}, {y:.0f}, {z:.0f} mm (LPS)"
 
 
 def label_warnings(

@@ -20,7 +20,7 @@ def save_patient(
     texts: dict[str, str] | None = None,
     draw: Callable[[Path], None] | None = None,
 ) -> None:
-    """Write ct.nrrd, labels.nrrd, organ.stl, support.stl and a surface for each part: all or nothing.
+    """Write ct.nrrd, labels.nrrd, corrections.nrrd if there are any, organ.stl, support.stl and a surface for each part: all or nothing.
 
     Args:
         patient: only its voxels and geometry are written.
@@ -38,7 +38,10 @@ def save_patient(
 
 
 def _write(patient: Patient, folder: Path, texts: dict[str, str]) -> None:
-    for name, image in (("ct", patient.ct), ("labels", patient.labels)):
+    images = {"ct": patient.ct, "labels": patient.labels}
+    if patient.corrections is not None:
+        images["corrections"] = patient.corrections
+    for name, image in images.items():
         bare = sitk.GetImageFromArray(sitk.GetArrayViewFromImage(image))  # without metadata
         bare.CopyInformation(image)
         save_image(bare, folder / f"{name}.nrrd")

@@ -16,7 +16,9 @@ from errors import PatientError
 from scenes.kidney_axes import kidney_axes
 from scenes.patient_space import Space
 from scenes.patients.body_orientation import orientation_warnings
-from scenes.patients.import_warnings import fat_warnings, label_warnings, stone_warnings
+from scenes.patients.class_corrections import corrections_of
+from scenes.patients.dense_findings import dense_findings
+from scenes.patients.import_warnings import fat_warnings, label_warnings
 from scenes.patients.kidney_plausibility import kidney_warnings
 from scenes.patients.label_islands import island_warnings
 from scenes.patients.label_shift import shift_warnings
@@ -52,6 +54,8 @@ CUT_AREA_MM2 = 100.0  # a pole that only touches the border is complete to withi
 LEAST_OVERLAP = 0.99
 MOST_VOLUME_OFF = 0.05
 OVERVIEW_MM = 1.5
+# The code of an imported label map; other tissues follow.
+KIDNEY = 1
 # A CT of a body contains fat and much brighter tissue.
 FAT_HU, LEAST_SPAN_HU = -60, 200
 
@@ -77,6 +81,9 @@ class Patient:
     draft: bool = False  # made by region growing
     position: Position = "supine"  # in the CT, which gives gravity
     space: Space | None = None  # of the axes of files that do not name it, by the user
+    corrections: sitk.Image | None = (
+        None  # uint8: a code of TISSUES where a class image corrects the classification
+    )
 
     @property
     def tumour(self) -> trimesh.Trimesh | None:
@@ -100,6 +107,7 @@ def import_patient(
     drawn: Sequence[LabelMap] = (),
     position: Position | None = None,
     progress: Progress = silent,
+    classes: Sequence[LabelMap] = (),
 ) -> Patient:
     """Crop one organ from a CT and its label map, and make its surfaces and its support.
 
@@ -115,6 +123,7 @@ def import_patient(
         drawn: the label maps before they were merged: some segments may be covered in ``labels``; none: they are ``labels``.
         position: how the patient lay in the CT; None: as in its header, else supine.
         progress: shows the progress of the surfaces.
+        classes: of class images, which correct the tissues around the organ and of its parts.
 
     Raises:
         PatientError: what was found, what was expected and what to do.
@@ -139,17 +148,23 @@ def import_patient(
     warnings = (
         *position_warnings(overview, actual_position),
         *orientation_warnings(overview, labels, midline, float(piece.grid.corners()[:, 2].mean())),
-        *_tissue_warnings(piece, grid, hounsfield, on_ct, coded, tissues),
-        *warnings_of_slices,
-        *island_warnings(labels, own, pieces, piece),
-        *label_warnings(labels, piece, organ is not None, drawn or [labels]),
+        *_misplaced(piece, grid, hounsfield, on_ct, coded),
     )
     found = part_masks(labels, piece)
     part_notes = parts_elsewhere(labels, piece, pieces, found, given)
     with part_surfaces_in_processes(found) as parts_made:
         surface = organ_surface(piece)
         _check_surface(surface, piece)
-        warnings += kidney_warnings(piece, labels, surface, actual_side, midline)
+        of_ct = grid, hounsfield, coded, tissues, surface
+        corrections, correction_notes = corrections_of(*of_ct, classes) if classes else (None, [])
+        dense, phase_note = dense_findings(*of_ct, corrections)
+        warnings += (
+            *dense,
+            *warnings_of_slices,
+            *island_warnings(labels, own, pieces, piece),
+            *label_warnings(labels, piece, organ is not None, drawn or [labels]),
+            *kidney_warnings(piece, labels, surface, actual_side, midline),
+        )
         bed = _support(support, surface, labels, piece, actual_position)
         parts = parts_made(progress)
     volumes = {part: float(inside.sum() * part_grid.voxel_ml) for part, (part_grid, inside) in found.items()}
@@ -157,6 +172,7 @@ def import_patient(
         ct=grid.image(hounsfield),
         labels=grid.image(coded),
         tissues=tissues,
+        corrections=corrections,
         organ=surface,
         parts=parts,
         support=bed,
@@ -165,32 +181,21 @@ def import_patient(
         overview=overview,
         source=ct.grid,
         series=ct.series,
-        notes=(*ct.notes, *position_notes, *part_notes),
+        notes=(*ct.notes, *position_notes, *part_notes, phase_note, *correction_notes),
         warnings=warnings,
         colours=colours_of_labels(labels, [*parts]),
         position=actual_position,
     )
 
 
-def _tissue_warnings(
-    piece: Organ,
-    grid: VoxelGrid,
-    hounsfield: np.ndarray,
-    on_ct: np.ndarray,
-    coded: np.ndarray,
-    tissues: dict[int, str],
+def _misplaced(
+    piece: Organ, grid: VoxelGrid, hounsfield: np.ndarray, on_ct: np.ndarray, coded: np.ndarray
 ) -> tuple[str, ...]:
-    """Warnings of what the CT shows in and around the organ; ``on_ct`` and ``coded`` are on its grid."""
-
-    def of(*wanted: str) -> np.ndarray:
-        return np.isin(coded, [code for code, tissue in tissues.items() if tissue in wanted])
-
+    """Warnings of labels that are not where the CT shows the organ; ``on_ct`` and ``coded`` are on its grid."""
     # Fat in the rim of a label that is shifted by a few millimetres has the same cause.
-    misplaced = shift_warnings(grid, hounsfield, piece.grid, piece.mask) or fat_warnings(
-        grid, hounsfield, on_ct, of("kidney"), float(piece.grid.spacing.max())
+    return shift_warnings(grid, hounsfield, piece.grid, piece.mask) or fat_warnings(
+        grid, hounsfield, on_ct, coded == KIDNEY, float(piece.grid.spacing.max())
     )
-    solid = of("kidney", "cortex", "medulla", "sinus")
-    return (*misplaced, *stone_warnings(grid, hounsfield, solid, of("urine")))
 
 
 def _support(
@@ -313,7 +318,7 @@ def _tissue_labels(labels: LabelMap, grid: VoxelGrid, on_ct: np.ndarray) -> tupl
     there = set(present_values(values))
     tissue_of = {v: s.tissue for v, s in labels.segments.items() if v in there and s.tissue}
     others = sorted(set(tissue_of.values()) - {"kidney", "tumour"})
-    codes = {tissue: code for code, tissue in enumerate(["kidney", "tumour", *others], start=1)}
+    codes = {tissue: code for code, tissue in enumerate(["kidney", "tumour", *others], start=KIDNEY)}
     coded = on_ct.astype(np.uint8)
     for value, tissue in tissue_of.items():
         if tissue != "kidney":

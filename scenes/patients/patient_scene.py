@@ -1,5 +1,7 @@
 """The scene of an imported patient: its files, the materials of its parts, the CT window, the hilum, the support, the probe and where it starts."""
 
+from typing import Any
+
 import numpy as np
 import SimpleITK as sitk
 import trimesh
@@ -14,6 +16,7 @@ from scenes.patients.readers.segment_names import Side
 from scenes.scene import AnatomyFiles, Attachment, Gravity, Image, MeshShape, Scene, Transducer
 from scenes.surfaces import depth_below_hull
 from scenes.tissue import NeoHookeanTissue, PartMaterial, PartName
+from scenes.tissue_classes.tissue_map import TISSUES
 
 FAT_HU = -110.0
 LEAST_WINDOW_HU = 310.0  # up to 200 HU at least, or an unenhanced kidney is white
@@ -95,6 +98,7 @@ def patient_scene(
                 ct="ct.nrrd",
                 labels="labels.nrrd",
                 tissues={str(code): tissue for code, tissue in patient.tissues.items()},
+                **_corrections(patient),
             )
         ),
         tissue=NeoHookeanTissue(parts={} if uniform else part_materials(patient)),
@@ -109,4 +113,15 @@ def patient_scene(
         press=opening_press(
             patient.organ, patient.tumour, patient.support, GRAVITY[patient.position], housing_mm
         ),
+    )
+
+
+def _corrections(patient: Patient) -> dict[str, Any]:
+    """The file of corrections, and the tissues of its values."""
+    if patient.corrections is None:
+        return {}
+    values = np.unique(sitk.GetArrayViewFromImage(patient.corrections))
+    return dict(
+        corrections="corrections.nrrd",
+        corrected_tissues={str(code): TISSUES[code - 1] for code in values.tolist() if code},
     )

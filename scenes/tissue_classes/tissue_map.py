@@ -4,7 +4,7 @@ What no CT shows (pyramids without enhancement, the renal fascia) is drawn on re
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import SimpleITK as sitk
@@ -152,6 +152,23 @@ def tissue_map(
     _write(codes[box], {"stone": dense.stone})
     drawn &= (own == 0) | (own == CODE["kidney"])
     return TissueMap(codes, np.rint(sharp).astype(np.int16), drawn, to_index)
+
+
+def dense_pieces_of_kidney(
+    hu: np.ndarray, labels: np.ndarray, organ: trimesh.Trimesh, index_from_mm: np.ndarray
+) -> tuple[DensePieces, np.ndarray]:
+    """Return the dense pieces that ``tissue_map`` finds in the same CT, and the transform (4, 4) from mm to their indices."""
+    spacing = np.linalg.norm(np.linalg.inv(index_from_mm[:3, :3]), axis=0)
+    factors = fine_factors(spacing)
+    own = refined_labels(labels, factors, spacing)
+    to_index = fine_index_from_mm(index_from_mm, factors)
+    shape = KidneyShape.of(organ, to_index, own.shape)
+    box = shape.box
+    found = _dense(refined(hu, factors)[box], own[box], shape, float(np.prod(spacing / factors)) / 1000)
+    # Stones, and other labels than the whole kidney's, are written over contrast agent.
+    shown = replace(found, urine=found.urine & ~found.stone & np.isin(own[box], [0, CODE["kidney"]]))
+    to_index[:3, 3] -= [a.start for a in box]
+    return shown, to_index
 
 
 def codes_of_labels(labels: np.ndarray, tissues: Mapping[int, str]) -> np.ndarray:

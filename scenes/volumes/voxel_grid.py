@@ -48,6 +48,22 @@ class VoxelGrid:
             np.array(image.GetDirection()).reshape(3, 3),
         )
 
+    @classmethod
+    def of_transform(cls, index_from_mm: np.ndarray, size: tuple[int, ...]) -> VoxelGrid:
+        """The grid of a size whose indices an affine transform (4, 4) gives from LPS [mm]."""
+        mm_from_index = np.linalg.inv(index_from_mm)
+        spacing = np.linalg.norm(mm_from_index[:3, :3], axis=0)
+        x, y, z = size
+        return cls((x, y, z), spacing, mm_from_index[:3, 3], mm_from_index[:3, :3] / spacing)
+
+    @property
+    def index_from_mm(self) -> np.ndarray:
+        """The affine transform (4, 4) from LPS [mm] to voxel indices."""
+        mm_from_index = np.eye(4)
+        mm_from_index[:3, :3] = self.direction * self.spacing
+        mm_from_index[:3, 3] = self.origin
+        return np.linalg.inv(mm_from_index)
+
     def checked(self, name: str) -> VoxelGrid:
         """This grid, if it is plausible. Raises PatientError that begins with ``name``."""
         size = check_3d(name, self.size)

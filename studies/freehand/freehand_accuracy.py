@@ -115,7 +115,7 @@ def measure(
     """All figures of one patient; starts Taichi anew."""
     start(arch)
     probe = load_probe(PROBE)
-    truth = resting(anatomy, probe, np.array(scene.gravity.direction), PIXELS)
+    truth = resting(anatomy, probe, np.array(scene.gravity.direction), PIXELS, scene.image.atlas)
     surfaces = surfaces_of(anatomy)
     rest = []
     for method in METHODS:

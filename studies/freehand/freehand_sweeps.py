@@ -60,12 +60,14 @@ def beads_of(organ: trimesh.Trimesh, tumour: trimesh.Trimesh | None) -> np.ndarr
     return inside[np.sort(nearest)]
 
 
-def resting(anatomy: LoadedAnatomy, probe: Probe, direction: np.ndarray, pixels: int) -> GroundTruthSweep:
+def resting(
+    anatomy: LoadedAnatomy, probe: Probe, direction: np.ndarray, pixels: int, draws: bool
+) -> GroundTruthSweep:
     """The slow sweep of the undeformed CT along the organ's long axis; Taichi must have been started."""
     if anatomy.ct is None:
         raise ValueError("a sweep needs a CT")
     organ, tumour = anatomy.organ, anatomy.tumour
-    scanned = scanned_anatomy(organ, anatomy.ct, anatomy, np.zeros(3))
+    scanned = scanned_anatomy(organ, anatomy.ct, anatomy, np.zeros(3), draws)
     scanner = Scanner(scanned, Unmoved(), probe, pixels, "background", "tissue")
     poses = _along(organ, probe, direction)
     beads = beads_of(organ, tumour)

@@ -39,7 +39,7 @@ class PlaneScan:
 def scan_patient(scene: Scene, anatomy: LoadedAnatomy, probe: Probe) -> list[PlaneScan]:
     """Return the scans of the standard planes of a patient whose kidney is labelled, at rest, with default settings."""
     assert anatomy.ct is not None
-    scanned = scanned_anatomy(anatomy.organ, anatomy.ct, anatomy, np.zeros(3))
+    scanned = scanned_anatomy(anatomy.organ, anatomy.ct, anatomy, np.zeros(3), scene.image.atlas)
     volumes = TruthVolumes.of(scanned)
     scanner = Scanner(scanned, Unmoved(), probe, PIXELS, "background", "tissue")
     scans = []

@@ -250,7 +250,9 @@ def of_frame(scene: Scene, anatomy: LoadedAnatomy, arch: str) -> Iterator[dict[s
         yield _alone("tumour's surface", tumour.update, [tumour], rehearsal.model)
     if anatomy.ct is None:
         return
-    yield from _images(rehearsal, scanned_anatomy(rehearsal.organ, anatomy.ct, anatomy, rehearsal.origin))
+    draws = scene.image.atlas
+    scanned = scanned_anatomy(rehearsal.organ, anatomy.ct, anatomy, rehearsal.origin, draws)
+    yield from _images(rehearsal, scanned)
     yield _whole_frame(rehearsal)
 
 

@@ -77,6 +77,7 @@ def test_all_surfaces_of_a_scene_come_out_where_they_are(patient, tmp_path, caps
     assert {path.name for path in out.iterdir()} == {f"{name}.stl" for name in sources} | {
         "ct.nrrd",
         "labels.nrrd",
+        "classes.seg.nrrd",
     }
     for name, source in sources.items():
         # Triangles have no order to rely on, but corners are float32 in both files: the same numbers.

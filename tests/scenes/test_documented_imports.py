@@ -60,6 +60,7 @@ def clinic(tmp_path_factory):
         exec(virtual_tumour())
         assert main([*words_of("import ct kidneys.nii.gz --organ 1,2 --side left"), "--out", "bed"]) == 0
         shutil.copy(folder / "bed" / "support.stl", folder / "bed.stl")
+        assert main(["export", "bed", "--out", "DIR"]) == 0
         yield folder
 
 

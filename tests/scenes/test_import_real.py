@@ -27,7 +27,7 @@ def test_a_real_kidney():
     patient = import_patient(open_ct(DATA / "ct" / CT), *label_map(labels, [VALUE]))
     assert patient.side == SIDE
     (warning,) = patient.warnings  # it has stones
-    assert "as bright as stone" in warning
+    assert "12 HU: unenhanced" in warning and "shown as stone" in warning
     assert patient.organ.volume / 1000 == pytest.approx(VOLUME_ML, rel=0.01)
     assert len(patient.organ.faces) == pytest.approx(5000, abs=20)
     assert_sound(patient.organ)

@@ -26,7 +26,6 @@ from synthetic_body import (
 import scenes.patients.patient_import
 from errors import PatientError
 from scenes.patients.check_picture import as_table, summary_rows
-from scenes.patients.import_warnings import STONE_ABOVE_MEDIAN_HU
 from scenes.patients.organ_selection import choose_organ, find_organs, midline_x
 from scenes.patients.patient_folder import save_patient
 from scenes.patients.patient_import import import_patient
@@ -35,6 +34,7 @@ from scenes.patients.readers.label_maps import LabelMap
 from scenes.patients.readers.segment_choice import absent_labels, assign_tissues
 from scenes.phantom import embedded_patient
 from scenes.scene import SceneError
+from scenes.tissue_classes.collecting_system import DENSE_ABOVE_HU
 from scenes.volumes.lazy_volume import LazyVolume
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -218,7 +218,7 @@ class TestOneCommandForManyPatients:
         voxel_ml = np.prod(kits[0].GetSpacing()) / 1000
         assert patient.volumes_ml["tumour"] == pytest.approx(voxels_of(kits[1], 2) * voxel_ml)
         assert patient.tissues[2] == "tumour" and (sitk.GetArrayViewFromImage(patient.labels) == 2).any()
-        assert patient.notes[1:] == patient.warnings == ()
+        assert patient.notes[1:-1] == patient.warnings == ()
         # The left kidney's voxels, without the right kidney's.
         own = sitk.GetArrayViewFromImage(kits[1])[points_of(kits[1])[..., 0] > 0]
         assert patient.volumes_ml["organ"] == pytest.approx((own > 0).sum() * voxel_ml)
@@ -226,20 +226,20 @@ class TestOneCommandForManyPatients:
     def test_a_tumour_in_the_other_kidney(self, kits):
         patient = imported(*kits, [1, 2], "right", 20.0, tumour=[2])
         assert patient.tumour is None and all("is small" in text for text in patient.warnings)
-        assert patient.notes[1:] == ("the tumour's label is only in the other kidney",)
+        assert patient.notes[1:-1] == ("the tumour's label is only in the other kidney",)
 
     def test_a_tumour_apart_from_both_is_left_out_and_is_no_third_organ(self, kits):
         """Though it is as large as one."""
         apart = drawn(kits[1], (1, LEFT), (1, RIGHT), (2, (np.array([0, -30.0, 40]), np.full(3, 20.0))))
         patient = imported(kits[0], apart, [1, 2], "left", 20.0, tumour=[2])
-        assert patient.tumour is None and patient.notes[1:] == ()
+        assert patient.tumour is None and patient.notes[1:-1] == ()
         (warning,) = patient.warnings
         assert "ml of the tumour's label touch no labelled kidney" in warning and "were left out" in warning
 
     def test_vessels_far_away(self, kits):
         far = drawn(kits[1], (1, LEFT), (2, TUMOUR), (4, (np.array([-40.0, 30, 0]), np.full(3, 9.0))))
         patient = imported(kits[0], far, [1], "left", 20.0, tumour=[2], artery=[4])
-        assert patient.notes[1:] == ("the artery's label is more than 15 mm from this kidney",)
+        assert patient.notes[1:-1] == ("the artery's label is more than 15 mm from this kidney",)
 
     def test_a_label_that_no_voxel_has(self, kits):
         """A note from the words, not from the voxels of one kidney."""
@@ -396,8 +396,9 @@ class TestWarnings:
 
     def test_a_body_as_it_should_be(self, patient):
         assert patient.warnings == ()
-        (note,) = patient.notes
-        assert note.startswith("assumed supine")
+        position, phase = patient.notes
+        assert position.startswith("assumed supine")
+        assert phase.startswith("contrast phase: enhanced, as the kidney has a median of 120 HU")
 
     def test_turned_over_or_mirrored(self, ct_and_labels):
         ct, labels = ct_and_labels
@@ -425,17 +426,20 @@ class TestWarnings:
         lines = imported(with_voxels(ct, voxels), shifted, [2], margin_mm=20.0, tumour=[3]).warnings
         assert len(lines) == len(words) and all(word in line for word, line in zip(words, lines, strict=True))
 
-    def test_what_is_as_bright_as_stone_unless_its_label_says_that_it_is_urine(self, ct_and_labels):
+    def test_contrast_agent_unless_its_label_says_that_it_is(self, ct_and_labels):
         ct, labels = ct_and_labels
         points = points_of(ct)
         stone, pelvis = level(points, (LEFT[0] + [0, 0, 25], np.full(3, 6.0))) < 0, level(points, PELVIS) < 0
         voxels, marks = sitk.GetArrayFromImage(ct), sitk.GetArrayFromImage(labels)
-        voxels[stone | pelvis], marks[pelvis] = 120 + STONE_ABOVE_MEDIAN_HU + 1, 4
+        voxels[stone | pelvis], marks[pelvis] = 120 + DENSE_ABOVE_HU + 300, 4
         bright, marked = with_voxels(ct, voxels), with_voxels(labels, marks)
         (warning,) = imported(bright, marked, [2], margin_mm=20.0, tumour=[3], urine=[4]).warnings
-        ml = stone.sum() * np.prod(ct.GetSpacing()) / 1000
-        assert f"{ml:.1f} ml inside the organ (" in warning and "--collecting" in warning
-        assert f"{ml:.1f} ml in the upper third, at {LEFT[0][0]:.0f}," in warning
+        # How much of it, on a finer grid: test_dense_findings.py.
+        assert (
+            "(--stones)" in warning
+            and "120 HU: enhanced" in warning
+            and f" ml in the upper third, at {LEFT[0][0]:.0f}," in warning
+        )
 
     def test_a_label_that_is_no_whole_kidney(self, ct_and_labels):
         """Hollow, and cut off above."""

@@ -99,7 +99,8 @@ def test_gravity_is_that_of_the_ct(monkeypatch, position):
     named = LabelMap.of(labels, {1: "kidney_right", 2: "kidney_left", 3: "tumour"})
     lazy = LazyVolume.of(with_voxels(ct, voxels))
     patient = import_patient(lazy, named, side="left", margin_mm=10.0, position=position)
-    assert patient.position == position and patient.warnings == patient.notes == ()
+    assert patient.position == position and patient.warnings == ()
+    assert all(note.startswith("contrast phase") for note in patient.notes)
     np.testing.assert_array_equal(used["gravity"], GRAVITY[position])
     assert patient_scene(patient).gravity.direction == GRAVITY[position]
     assert {"prone": "lying prone", "left-decubitus": "left decubitus"}[position] in as_table(

@@ -34,7 +34,7 @@ NAMES = {
     "renal arteries and veins": ("vessel", None), "blood vessels": ("vessel", None), "inferior_vena_cava": ("vein", None), "ureter_right": ("urine", "right"), "Renal pelvis": ("urine", None),
     "renal_cortex": ("cortex", None), "renal sinus fat": ("sinus", None), "liver": ("liver", None),
     "rib_left_11": ("bone", "left"), "vertebrae_L1": ("bone", None), "hip_left": ("bone", "left"),
-    "spleen": (None, None), "Segment_1": (None, None), "colon": (None, None), "iliopsoas_right": ("muscle", "right"),
+    "spleen": ("spleen", None), "Segment_1": (None, None), "colon": (None, None), "iliopsoas_right": ("muscle", "right"),
 }  # fmt: skip
 KIDNEY = np.array([-28.0, 24.0, -393.0]), np.array([3.0, 2.5, 5.0])
 TUMOUR = np.array([-26.5, 24.5, -391.0]), np.array([1.6, 1.4, 2.6])

@@ -34,7 +34,7 @@ CODES = {
     "renal artery": (STRUCTURE, "SCT^2841007^Renal artery", RIGHT_CODE, NONE, NONE, "artery", {"right"}),
     "artery of the kidney": (STRUCTURE, "SCT^51114001^Artery", NONE, KIDNEY, NONE, "artery", set()),
     "renal pelvis": (STRUCTURE, "SCT^25990002^Renal pelvis", NONE, NONE, NONE, "urine", set()),
-    "spleen": (STRUCTURE, "SCT^78961009^Spleen", NONE, NONE, NONE, None, set()),
+    "spleen": (STRUCTURE, "SCT^78961009^Spleen", NONE, NONE, NONE, "spleen", set()),
     "both kidneys": (STRUCTURE, KIDNEY, BOTH, NONE, NONE, "kidney", set()),
     "in German": (STRUCTURE, "SCT^64033007^Organ der Harnbildung", "SCT^7771000^li.", NONE, NONE, "kidney", {"left"}),
     "unknown code, known words": (STRUCTURE, "FMA^7205^Left kidney", NONE, NONE, NONE, "kidney", {"left"}),
@@ -130,7 +130,7 @@ NAMED = [
     # A name that is understood comes before the codes, and its side is added to theirs.
     ("GTV", "tissue of the left kidney", "tumour", "left"),
     ("kidney left", "as 3D Slicer begins", "kidney", "left"),
-    ("spleen", "as 3D Slicer begins", None, None),
+    ("spleen", "as 3D Slicer begins", "spleen", None),
     # Letters of a name that is not understood are no side where the codes have one.
     ("L 4711 R2", "kidney, right", "kidney", "right"),
 ]  # fmt: skip

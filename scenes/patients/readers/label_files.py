@@ -34,6 +34,7 @@ from scenes.patients.readers.surface_labels import read_surfaces
 from scenes.surfaces import ENDINGS as SURFACE_ENDINGS
 from scenes.surfaces import OTHER_ENDINGS, is_surface_file
 from scenes.terminal import Progress, silent
+from scenes.tissue_classes.class_image import TAG
 from scenes.volumes.dicom_references import DicomReferences
 from scenes.volumes.lazy_volume import LazyVolume
 from scenes.volumes.volume_files import ENDINGS, file_volume, is_volume_file
@@ -179,6 +180,7 @@ def _label_map_file(path: Path, space: Space | None) -> Segmentation:
         grid=volume.grid,
         empty=tuple(unused.values()),
         space=volume.space,
+        is_class_image=any(TAG in text for key, text in volume.metadata.items() if key.endswith("_Tags")),
     )
 
 

@@ -139,6 +139,7 @@ class Segmentation:
     grid: VoxelGrid | None = None  # of label maps: all voxels of the first
     empty: tuple[Segment, ...] = ()  # segments that no voxel has
     space: Space | None = None  # of the axes, by the user, where a file names none
+    is_class_image: bool = False  # of the tissue of every voxel, as an export writes it
 
 
 def is_left_out(segment: Segment, wanted: Collection[str], is_tissue: bool = True) -> bool:

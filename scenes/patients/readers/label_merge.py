@@ -9,7 +9,7 @@ from scenes.patients.readers.label_maps import LESIONS, LabelMap, Segment, prese
 from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 # Of overlapping segments, later tissues cover earlier ones: small structures cover their surroundings.
-MERGE_ORDER = (None, "fat", "muscle", "bone", "liver", "kidney", "cortex", "medulla", "sinus", "vessel", "vein", "artery", "urine", "cyst", "tumour", "necrosis", "stone")  # fmt: skip
+MERGE_ORDER = (None, "soft-tissue", "fat", "fascia", "muscle", "perimysium", "bone", "liver", "spleen", "bowel", "gas", "fluid", "kidney", "cortex", "medulla", "arcuate", "sinus", "vessel", "vein", "artery", "urine", "cyst", "tumour", "pseudocapsule", "necrosis", "stone", "metal")  # fmt: skip
 
 
 def merge_label_maps(maps: list[LabelMap], organ: Sequence[str] = ()) -> tuple[LabelMap, list[int] | None]:

@@ -4,6 +4,8 @@ import re
 import unicodedata
 from typing import Literal
 
+from scenes.tissue_classes.tissue_map import TISSUES
+
 Side = Literal["left", "right"]
 
 # Patterns are for plain names (``_plain``): lower case, without accents, one space between words. The first match counts: a renal mass is a
@@ -30,6 +32,8 @@ TISSUE_OF_NAME: tuple[tuple[str, str], ...] = (
     ("muscle", r"muscle|muskel|psoas|autochthon|gluteus|quadratus"),
     ("fat", r"\bfat\b|adipose|fett"),
 )  # fmt: skip
+# The program's own names, as a class image has them.
+OWN_NAMES = {tissue.replace("-", " "): tissue for tissue in TISSUES}
 # Structures of TotalSegmentator that are too far from a kidney to be in its image.
 FAR = (
     r"brain|skull|\bface\b|heart|atri(um|al)|ventric|myocard|lung|pulmon|humerus|clavic|scapula|femur|sacrum|\bhips?\b|"
@@ -42,13 +46,13 @@ OUTLINE = (
     r"\btable ?(top)?$|^mattress"
 )
 # Structures that are derived from others by a margin or for the planning of a treatment, as TG-263 (doi 10.1016/j.ijrobp.2017.12.013) and
-# its users name them: PRV, CTV, PTV, ITV, a "z" before the name for optimisation, "~" for a part. A GTV is the tumour itself.
+# its users name them, and by the atlas of a class image: PRV, CTV, PTV, ITV, a "z" before the name for optimisation, "~" for a part. A GTV is the tumour itself.
 DERIVED = (
     r"\b(prv|(i ?)?[cp]tv|itv|i ?gtv)|bounding box|normal tissue|"
     r"\b(ring|rind|opt(i|im|imi[sz]\w+)?|margins?|bbox|exp(and\w*|ansion)?|dil(at\w+)?|ero(ded|sion)|shr[iu]nk\w*|grow\w*|shell|hull|halo|"
     r"avoid(ance)?|eval|cropp?(ed)?|(iso)?dose)\d*\b"
 )
-DERIVED_SIGNS = r"^z(?=[A-Z_ ])|^_|~|\+\s*\d|-\s*\d+([.,]\d+)?\s*(mm|cm)\b"
+DERIVED_SIGNS = r"^z(?=[A-Z_ ])|^_|~|\(drawn\)$|\+\s*\d|-\s*\d+([.,]\d+)?\s*(mm|cm)\b"
 # Of a kidney's name: the width of a margin. Of a tumour's it is the size.
 MARGIN = r"\d ?[mc]m\b"
 # A kidney with or without its tumour, such as "Kidney_L-GTV", "kidney w/o mass", "Kidney + tumour": first the kidney, then the tumour.
@@ -126,6 +130,8 @@ def is_plain_kidney(name: str) -> bool:
 def _tissue(name: str) -> str | None:
     """The tissue that a name means, also where it is of a derived structure; "" of a known one that is not modelled; None without."""
     plain = _plain(name)
+    if plain in OWN_NAMES:
+        return OWN_NAMES[plain]
     found = next((tissue for tissue, pattern in TISSUE_OF_NAME if re.search(pattern, plain)), None)
     if found in ("tumour", "cyst"):
         parts = re.match(COMPOSITE, unicodedata.normalize("NFC", name))
