@@ -30,7 +30,7 @@ DOPPLER_MODES: tuple[DopplerMode, ...] = get_args(DopplerMode)
 
 # Grey values: the exponent of the share of the dynamic range. On a scanner's screen most of the tissue is dark.
 GreyMap = Literal["linear", "dark"]
-GREY_EXPONENTS: dict[GreyMap, float] = {"linear": 1.0, "dark": 1.5}
+GREY_EXPONENTS: dict[GreyMap, float] = {"linear": 1.0, "dark": 3.0}
 # How much weaker harmonics are, where they have built up; and the depth at which they have half of that amplitude. An estimate.
 HARMONIC_LOSS_DB, BUILD_UP_MM = 15.0, 12.0
 # Range of the angles of spatial compounding.
@@ -96,9 +96,9 @@ class Probe(BaseModel):
     elevation_focus_mm: float = Field(25.0, gt=0, le=300)
     elevation_width_mm: float = Field(2.0, gt=0, le=20)
     bandwidth_percent: float = Field(75.0, ge=20, le=150)
-    noise_db: float = Field(-105.0, ge=-200, le=0)
+    noise_db: float = Field(-113.0, ge=-200, le=0)
     ringing_db: float = Field(-36.0, ge=-200, le=0)
-    gain_percent: Percent = 54.0
+    gain_percent: Percent = 68.0
     dyn_range_db: float = Field(60.0, ge=20, le=120)
     grey_map: GreyMap = "dark"
     steering_deg: float = Field(0.0, ge=-30, le=30)
@@ -109,7 +109,7 @@ class Probe(BaseModel):
     colour_gain_percent: Percent = 50.0
     colour_steering_deg: float = Field(0.0, ge=-30, le=30)
     time_gain_compensation: Sliders = (50.0,) * TGC_SLIDERS
-    depth_compensation_db_cm_mhz: float = Field(0.65, ge=0, le=5)
+    depth_compensation_db_cm_mhz: float = Field(0.7, ge=0, le=5)
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Probe":

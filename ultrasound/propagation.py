@@ -37,7 +37,7 @@ CENTRAL_PLANE = ((0.0, 1.0),)
 THICK_PLANE = ((0.0, 2 / 3), (-(1.5**0.5), 1 / 6), (1.5**0.5, 1 / 6))
 # The renal capsule's echo where the beam meets it squarely, the angle [rad] by which it falls to exp(-1/2), and the share of a mirror. An estimate:
 # sonographers expect a thin bright line, which fades where the beam is more than 20 degrees off.
-CAPSULE, CAPSULE_TILT, CAPSULE_MIRROR = 0.06, float(np.radians(9)), 0.85
+CAPSULE, CAPSULE_TILT, CAPSULE_MIRROR = 0.1, float(np.radians(10)), 0.85
 # What has less impedance is gas: in an empty crater no fluid stays.
 LEAST_FLUID_MRAYL = 0.3
 

@@ -1,18 +1,24 @@
-"""What a CT does not show, drawn as atlases of anatomy have it: renal pyramids, and the renal fascia."""
+"""What a CT does not show, drawn as atlases of anatomy have it: renal pyramids, the renal fascia, and the layers of muscle."""
 
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from scenes.tissue_classes.fine_grid import refined
+
 # Cortex over the pyramids, and the distance of the middles of their bases: 7 to 10 mm, and 7 to 18 pyramids in a kidney (Hansen, Nielsen &
 # Ewertsen 2016, Diagnostics 6, 2).
-CORTEX_MM, APART_MM = 6.5, 22.0
+CORTEX_MM, APART_MM = 6.0, 21.0
 # Columns of cortex between pyramids, and the share of its base's radius that a pyramid has at its papilla.
-COLUMN_MM, PAPILLA_SHARE = 3.0, 0.35
+COLUMN_MM, PAPILLA_SHARE = 2.5, 0.4
 # A pyramid is at least so high.
 LEAST_HEIGHT_MM = 4.0
 # The fascia: in fat, so far from what is behind it, at least so far from the kidney and no farther than the third value.
 BEFORE_MM, LEAST_MM, MOST_MM = 3.0, 4.0, 20.0
+# Sheets of perimysium in muscle: distance, and where they are, as a threshold of noise of unit SD smoothed over this distance.
+SHEETS_MM, SHEETS_ABOVE, SHEETS_OVER_MM, SEED = 4.0, -0.2, 4.0, 20151124
+# Depths in muscle are computed in cells of about this size.
+CELL_MM = 2.0
 
 
 def draw_pyramids(
@@ -67,3 +73,17 @@ def draw_fascia(
     distance = ndimage.distance_transform_edt(~others, sampling=sampling)
     sheet = np.abs(distance - BEFORE_MM) <= 0.5 * float(spacing_mm.max())
     return fat & sheet & (from_kidney_mm > LEAST_MM) & (from_kidney_mm < MOST_MM)
+
+
+def draw_perimysium(muscle: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
+    """Return broken sheets (nx, ny, nz) of connective tissue in muscle, one voxel thick, parallel to its surface."""
+    step = np.maximum(np.rint(CELL_MM / spacing_mm), 1).astype(int)
+    coarse = muscle[tuple(slice(None, None, k) for k in step)]
+    depth = ndimage.distance_transform_edt(coarse, sampling=spacing_mm * step)
+    noise = np.random.default_rng(SEED).standard_normal(coarse.shape, dtype=np.float32)
+    noise = ndimage.gaussian_filter(noise, SHEETS_OVER_MM / 2 / (spacing_mm * step))
+    there = refined(noise / max(float(noise.std()), 1e-6), step)
+    cut = tuple(slice(n) for n in muscle.shape)
+    along = refined(depth, step)[cut] % SHEETS_MM
+    sheet = np.abs(along - SHEETS_MM / 2) <= 0.5 * float(spacing_mm.mean())
+    return muscle & sheet & (there[cut] > SHEETS_ABOVE)

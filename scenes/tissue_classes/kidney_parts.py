@@ -15,8 +15,9 @@ CORTEX_ABOVE_MEDULLA_HU, OUTER_MM, INNER_MM, LEAST_VOXELS = 40.0, (2.0, 5.0), (9
 # Fat nearer to the kidney's outer surface than this is partial volume of its label's rim.
 RIM_MM = 5.0
 FAT_BELOW_HU = -20.0
-# In the hollow of a kidney, what is brighter is a vessel or the pelvis: without contrast agent, and as a share of the parenchyma's HU.
-VESSEL_ABOVE_HU, ENHANCED_VESSEL_SHARE = 15.0, 0.6
+# In the hollow of a kidney, what is nearly as bright as parenchyma is a vessel or the pelvis: without contrast agent, so much darker at most,
+# as fat in the same voxels makes more of a difference; with it, so much of its HU at least.
+VESSEL_BELOW_MEDIAN_HU, ENHANCED_VESSEL_SHARE = 10.0, 0.6
 # In a kidney with contrast agent, what has less than this share of the parenchyma's HU is sinus or a calyx without.
 SINUS_SHARE = 0.5
 
@@ -40,7 +41,9 @@ def kidney_parts(
     median = median_hu(hu, parenchyma)
     is_enhanced = median > ENHANCED_FROM_HU
     deep = parenchyma & (depth_mm > RIM_MM)
-    vessel = hollow & (hu > (ENHANCED_VESSEL_SHARE * median if is_enhanced else VESSEL_ABOVE_HU))
+    vessel = hollow & (
+        hu > (ENHANCED_VESSEL_SHARE * median if is_enhanced else median - VESSEL_BELOW_MEDIAN_HU)
+    )
     sinus = (hollow & ~vessel) | (deep & (hu < FAT_BELOW_HU))
     if is_enhanced:
         sinus |= deep & (hu < SINUS_SHARE * median)

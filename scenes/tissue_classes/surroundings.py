@@ -12,6 +12,8 @@ GAS_BELOW_HU, FAT_BELOW_HU, METAL_ABOVE_HU = -300.0, -30.0, 2500.0
 BLOOD_ABOVE_HU, DENSE_ABOVE_HU = 140.0, 260.0
 # Marrow where its shell is not closed: share of its surface that is bone; without contrast agent, by its HU and volume.
 MARROW_SURFACE, MARROW_ABOVE_HU, LEAST_MARROW_ML = 0.4, 120.0, 0.4
+# Contrast agent in the bowel: so far in front of the spine's middle, and with this share of its volume deeper than a bone's shell.
+BEFORE_SPINE_MM, SHELL_MM, SOLID_SHARE = 15.0, 2.5, 0.1
 # Of an enhanced CT, muscle is darker than this, liver and spleen are brighter. Fluid in the bowel is darker than the third value.
 LIVER_ABOVE_HU, FLUID_BELOW_HU = 88.0, 32.0
 # Large bodies of soft tissue are searched in cells of this size; they contain a ball of the first radius, liver and spleen of the second.
@@ -48,7 +50,9 @@ def surroundings(
     ``hu`` is smoothed; ``near`` is a box around the kidney.
     """
     gas = (hu < GAS_BELOW_HU) & ~kidney
-    bone = bone | _marrow(hu, bone, kidney, place)
+    agent = _oral_agent(hu, bone, place)
+    bone = bone & ~agent
+    bone = bone | _marrow(hu, bone, kidney | agent, place)
     fat = (hu < FAT_BELOW_HU) & ~gas & ~kidney
     beside = _dilated(kidney[near], 2)
     # Voxels between kidney and fat have the HU of other soft tissue, by partial volume.
@@ -61,7 +65,25 @@ def surroundings(
         vessel = soft & (hu > BLOOD_ABOVE_HU) & (hu < DENSE_ABOVE_HU)
         vessel[near] &= ~beside
         masks["vessel"] = vessel
+    masks["bowel"] = masks["bowel"] | agent
     return masks | {"bone": bone, "metal": hu > METAL_ABOVE_HU}
+
+
+def _oral_agent(hu: np.ndarray, bone: np.ndarray, place: Place) -> np.ndarray:
+    """Return what was taken for bone, but is contrast agent in the bowel: in front of the spine, and solid, where a bone is a shell."""
+    agent = np.zeros(bone.shape, bool)
+    spine = _spine(bone, np.ones(3), place)
+    pieces, _ = ndimage.label(bone)
+    for n, box in enumerate(ndimage.find_objects(pieces), 1):
+        piece = pieces[box] == n
+        bright = piece & (hu[box] > DENSE_ABOVE_HU)
+        if spine is None or not bright.any():
+            continue
+        at = place.of_indices(np.argwhere(bright).mean(axis=0)[None] + [axis.start for axis in box])[0]
+        solid = ndimage.distance_transform_edt(np.pad(bright, 1), sampling=place.spacing_mm) > SHELL_MM
+        if at[1] < spine[1] - BEFORE_SPINE_MM and solid.sum() > SOLID_SHARE * bright.sum():
+            agent[box] |= piece
+    return agent
 
 
 def _marrow(hu: np.ndarray, bone: np.ndarray, kidney: np.ndarray, place: Place) -> np.ndarray:

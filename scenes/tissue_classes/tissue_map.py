@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from scenes.tissue_classes.bones import bones
 from scenes.tissue_classes.collecting_system import DensePieces, dense_pieces
-from scenes.tissue_classes.drawn_anatomy import MOST_MM, draw_fascia, draw_pyramids
+from scenes.tissue_classes.drawn_anatomy import MOST_MM, draw_fascia, draw_perimysium, draw_pyramids
 from scenes.tissue_classes.fine_grid import (
     FAR_MM,
     SURFACE_MM,
@@ -32,7 +32,20 @@ from scenes.tissue_classes.surroundings import Place, surroundings
 
 # In the order of their codes.
 TISSUES = (
-    *("gas", "fat", "fascia", "soft-tissue", "muscle", "liver", "spleen", "bowel", "bone", "metal", "fluid"),
+    *(
+        "gas",
+        "fat",
+        "fascia",
+        "soft-tissue",
+        "muscle",
+        "perimysium",
+        "liver",
+        "spleen",
+        "bowel",
+        "bone",
+        "metal",
+        "fluid",
+    ),
     *("kidney", "cortex", "medulla", "arcuate", "sinus", "urine", "stone", "vessel", "artery", "vein"),
     *("tumour", "pseudocapsule", "necrosis", "cyst"),
 )
@@ -41,7 +54,7 @@ PARENCHYMA = ("kidney", "cortex", "medulla")
 # Behind the fat in which the renal fascia is.
 BEHIND_FASCIA = ("muscle", "liver", "spleen")
 # A hollow of the kidney is where no ball of this radius fits in.
-CONCAVITY_MM = 10.0
+CONCAVITY_MM = 15.0
 MARGIN_MM = MOST_MM + 4.0
 
 
@@ -130,6 +143,9 @@ def tissue_map(
     _write(codes[box], {"urine": dense.urine})
     if draws:
         drawn[box] = _draw(codes[box], kidney, shape, place.spacing_mm)
+        layers = draw_perimysium(of_tissues(codes, "muscle"), place.spacing_mm)
+        codes[layers] = CODE["perimysium"]
+        drawn |= layers
     _write_labels(codes, own, sharp, place.spacing_mm)
     _write(codes[box], {"stone": dense.stone})
     drawn &= (own == 0) | (own == CODE["kidney"])
