@@ -28,6 +28,7 @@ COLOURS = {
     "fascia": (255, 255, 255),
     "soft-tissue": (150, 150, 170),
     "muscle": (160, 70, 70),
+    "perimysium": (220, 150, 150),
     "liver": (120, 60, 20),
     "spleen": (150, 80, 160),
     "bowel": (120, 160, 90),
@@ -70,7 +71,7 @@ def sheet_figure(patient: ImagedPatient, scans: Sequence[PlaneScan], title: str)
     column = COLUMN_PIXELS if probe.sector is None else SECTOR_PIXELS
     width, depth, _ = probe.extent_mm
     size = len(scans) * column, 4 * column * depth / width + TITLE_PIXELS + LEGEND_PIXELS
-    figure = Figure([each / DPI for each in size])
+    figure = Figure((size[0] / DPI, size[1] / DPI))
     axes = figure.subplots(4, len(scans), squeeze=False)
     figure.subplots_adjust(0, LEGEND_PIXELS / size[1], 1, 1 - TITLE_PIXELS / size[1], 0.02, 0.02)
     shown: set[str] = set()
@@ -84,7 +85,7 @@ def sheet_figure(patient: ImagedPatient, scans: Sequence[PlaneScan], title: str)
         column_axes[0].set_title(scan.name, fontsize=10)
     figure.suptitle(title, fontsize=13, y=1 - 0.2 * TITLE_PIXELS / size[1])
     patches = [
-        Patch(facecolor=np.array(colour) / 255, edgecolor="grey", label=name)
+        Patch(facecolor="#" + bytes(colour).hex(), edgecolor="grey", label=name)
         for name, colour in COLOURS.items()
         if name in shown
     ]

@@ -53,26 +53,18 @@ def _crossings(truth: ScanlineTruth) -> np.ndarray:
     rows = []
     inside = truth.surface_mm < 0
     for line, sample in np.argwhere(inside[:, 1:] != inside[:, :-1]):
-        if truth.depth_mm[sample] < DEPTHS_MM[0] + CAPSULE_MM or not truth.seen[line, sample + 1]:
-            continue
         way = slice(sample + 1, None) if inside[line, sample + 1] else slice(sample, None, -1)
-        deep, power = -truth.surface_mm[line, way], truth.power[line, way]
-        end = _first(deep < 0)
-        deep, power = deep[:end], power[:end]
-        beneath = (deep >= INSIDE_MM[0]) & (deep <= INSIDE_MM[1])
-        if (
-            not beneath.any()
-            or deep.max() < INSIDE_MM[1]
-            or (truth.kidney_mm[line, way][:end][beneath] > 0).any()
-        ):
+        deep = -truth.surface_mm[line, way]
+        end = _first((deep > INSIDE_MM[1]) | (deep < 0))
+        if end == len(deep) or deep[end] < 0:
             continue
-        if (
-            not truth.seen[line, way][:end][beneath].all()
-            or truth.depth_mm[way][:end][beneath].min() < DEPTHS_MM[0]
-        ):
+        deep, power, depth = deep[:end], truth.power[line, way][:end], truth.depth_mm[way][:end]
+        beneath, control = deep >= INSIDE_MM[0], np.abs(deep - CONTROL_MM) <= CAPSULE_MM
+        is_kidney = (truth.kidney_mm[line, way][:end][beneath] < 0).all()
+        first = min(depth[0] - CAPSULE_MM, depth[-1])
+        if not is_kidney or first < DEPTHS_MM[0] or not truth.seen[line, way][:end].all():
             continue
         near = truth.power[line, np.abs(truth.depth_mm - truth.depth_mm[sample]) <= CAPSULE_MM]
-        control = np.abs(deep - CONTROL_MM) <= CAPSULE_MM
         rows.append(
             (truth.incidence_deg[line, sample], near.max(), power[control].max(), power[beneath].mean())
         )
