@@ -4,7 +4,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from scenes.tissue_classes.fine_grid import refined
+from scenes.tissue_classes.fine_grid import CELL_MM, coarse_distance, refined
 
 # Cortex over the pyramids, and the distance of the middles of their bases: 7 to 10 mm, and 7 to 18 pyramids in a kidney (Hansen, Nielsen &
 # Ewertsen 2016, Diagnostics 6, 2).
@@ -17,8 +17,6 @@ LEAST_HEIGHT_MM = 4.0
 BEFORE_MM, LEAST_MM, MOST_MM = 3.0, 4.0, 20.0
 # Sheets of perimysium in muscle: distance, and where they are, as a threshold of noise of unit SD smoothed over this distance.
 SHEETS_MM, SHEETS_ABOVE, SHEETS_OVER_MM, SEED = 4.0, -0.2, 4.0, 20151124
-# Depths in muscle are computed in cells of about this size.
-CELL_MM = 2.0
 
 
 def draw_pyramids(
@@ -69,21 +67,18 @@ def draw_fascia(
     fat: np.ndarray, others: np.ndarray, from_kidney_mm: np.ndarray, spacing_mm: np.ndarray
 ) -> np.ndarray:
     """Return the renal fascia (nx, ny, nz): a sheet in the perirenal fat, one voxel thick, before what is behind the fat."""
-    sampling = spacing_mm
-    distance = ndimage.distance_transform_edt(~others, sampling=sampling)
-    sheet = np.abs(distance - BEFORE_MM) <= 0.5 * float(spacing_mm.max())
+    sheet = np.abs(coarse_distance(~others, spacing_mm) - BEFORE_MM) <= 0.5 * float(spacing_mm.max())
     return fat & sheet & (from_kidney_mm > LEAST_MM) & (from_kidney_mm < MOST_MM)
 
 
 def draw_perimysium(muscle: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
     """Return broken sheets (nx, ny, nz) of connective tissue in muscle, one voxel thick, parallel to its surface."""
+    # Noise of one value a cell, between which it is interpolated.
     step = np.maximum(np.rint(CELL_MM / spacing_mm), 1).astype(int)
-    coarse = muscle[tuple(slice(None, None, k) for k in step)]
-    depth = ndimage.distance_transform_edt(coarse, sampling=spacing_mm * step)
-    noise = np.random.default_rng(SEED).standard_normal(coarse.shape, dtype=np.float32)
+    cells = -(-np.array(muscle.shape) // step)
+    noise = np.random.default_rng(SEED).standard_normal(cells, dtype=np.float32)
     noise = ndimage.gaussian_filter(noise, SHEETS_OVER_MM / 2 / (spacing_mm * step))
-    there = refined(noise / max(float(noise.std()), 1e-6), step)
-    cut = tuple(slice(n) for n in muscle.shape)
-    along = refined(depth, step)[cut] % SHEETS_MM
+    there = refined(noise / max(float(noise.std()), 1e-6), step)[tuple(slice(n) for n in muscle.shape)]
+    along = coarse_distance(muscle, spacing_mm) % SHEETS_MM
     sheet = np.abs(along - SHEETS_MM / 2) <= 0.5 * float(spacing_mm.mean())
-    return muscle & sheet & (there[cut] > SHEETS_ABOVE)
+    return muscle & sheet & (there > SHEETS_ABOVE)

@@ -12,7 +12,9 @@ from scenes.surfaces import signed_distance_from
 # Voxels are divided until they are no longer than this.
 LONGEST_MM = 1.6
 # Distances from the organ's surface are computed at this spacing, and interpolated.
-SURFACE_MM = 2.0
+SURFACE_MM = 3.0
+# Distances within large bodies are computed in cells of this size.
+CELL_MM = 2.0
 FAR_MM = 1e4
 Box = tuple[slice, ...]
 
@@ -67,6 +69,14 @@ def signed_distance_of(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
     outside = ndimage.distance_transform_edt(~mask, sampling=spacing_mm)
     inside = ndimage.distance_transform_edt(mask, sampling=spacing_mm)
     return np.where(mask, half - inside, outside - half).astype(np.float32)
+
+
+def coarse_distance(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
+    """Return distances [mm] (nx, ny, nz) of the voxels of a mask from those outside it, computed in cells of about CELL_MM, and interpolated."""
+    step = np.maximum(np.rint(CELL_MM / spacing_mm), 1).astype(int)
+    coarse = mask[tuple(slice(None, None, k) for k in step)]
+    distance = refined(ndimage.distance_transform_edt(coarse, sampling=spacing_mm * step), step)
+    return distance[tuple(slice(n) for n in mask.shape)]
 
 
 def box_around(mask: np.ndarray, voxels: int) -> Box:

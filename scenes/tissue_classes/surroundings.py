@@ -80,9 +80,10 @@ def _oral_agent(hu: np.ndarray, bone: np.ndarray, place: Place) -> np.ndarray:
         if spine is None or not bright.any():
             continue
         at = place.of_indices(np.argwhere(bright).mean(axis=0)[None] + [axis.start for axis in box])[0]
-        solid = ndimage.distance_transform_edt(np.pad(bright, 1), sampling=place.spacing_mm) > SHELL_MM
-        if at[1] < spine[1] - BEFORE_SPINE_MM and solid.sum() > SOLID_SHARE * bright.sum():
-            agent[box] |= piece
+        if at[1] < spine[1] - BEFORE_SPINE_MM:
+            depth = ndimage.distance_transform_edt(np.pad(bright, 1), sampling=place.spacing_mm)
+            if (depth > SHELL_MM).sum() > SOLID_SHARE * bright.sum():
+                agent[box] |= piece
     return agent
 
 
