@@ -19,9 +19,8 @@ DPI = 100
 # Width of an image on the sheet [pixels]: a sector is wider than it shows.
 COLUMN_PIXELS, SECTOR_PIXELS = 310, 480
 TITLE_PIXELS, LEGEND_PIXELS = 70, 60
-LABEL_SHARE = 0.4
-# Grey values and colours that a sheet has: more would make its file larger than 1.5 MB.
-SHEET_COLOURS = 160
+# More grey values would make the file of a sheet larger than 1.5 MB.
+GREY_VALUES = 96
 COLOURS = {
     "gas": (0, 0, 0),
     "fat": (232, 212, 100),
@@ -57,7 +56,7 @@ def write_sheet(patient: ImagedPatient, scans: Sequence[PlaneScan], title: str, 
     """Write the sheet of the planes of one patient and one probe. Raises OSError."""
     drawn = BytesIO()
     sheet_figure(patient, scans, title).savefig(drawn, dpi=DPI)
-    sheet = Image.open(drawn).convert("RGB").quantize(SHEET_COLOURS, dither=Image.Dither.NONE)
+    sheet = Image.open(drawn).convert("RGB").quantize(palette=_palette(), dither=Image.Dither.NONE)
     with atomic_write(path) as partial:
         sheet.save(partial, "PNG", optimize=True)
 
@@ -78,17 +77,15 @@ def sheet_figure(patient: ImagedPatient, scans: Sequence[PlaneScan], title: str)
     for scan, column_axes in zip(scans, axes.T, strict=True):
         classes = classes_of(patient, scan)
         shown |= set(np.unique(classes))
-        images = scan.ct, labels_over_ct(patient, scan), coloured(classes), scan.b_mode
-        for image, each in zip(images, column_axes, strict=True):
+        for image, each in zip((scan.ct, scan.ct, coloured(classes), scan.b_mode), column_axes, strict=True):
             each.imshow(image, cmap="gray", vmin=0, vmax=255, aspect="auto", interpolation="bilinear")
             each.axis("off")
+        labels = labels_of(patient, scan)
+        for name in set(np.unique(labels)) - {""}:
+            column_axes[1].contour(labels == name, [0.5], colors=[_hex(name)], linewidths=1)
         column_axes[0].set_title(scan.name, fontsize=10)
     figure.suptitle(title, fontsize=13, y=1 - 0.2 * TITLE_PIXELS / size[1])
-    patches = [
-        Patch(facecolor="#" + bytes(colour).hex(), edgecolor="grey", label=name)
-        for name, colour in COLOURS.items()
-        if name in shown
-    ]
+    patches = [Patch(facecolor=_hex(name), edgecolor="grey", label=name) for name in COLOURS if name in shown]
     figure.legend(handles=patches, loc="lower center", ncols=len(patches), fontsize=10, frameon=False)
     return figure
 
@@ -99,19 +96,30 @@ def classes_of(patient: ImagedPatient, scan: PlaneScan) -> np.ndarray:
     return _names_at(voxels.labels, voxels.tissues, voxels.index_from_mm, scan)
 
 
-def labels_over_ct(patient: ImagedPatient, scan: PlaneScan) -> np.ndarray:
-    """Return the CT (rows, columns, 3) uint8 with the labels of the patient, not classified, in their colours over it."""
+def labels_of(patient: ImagedPatient, scan: PlaneScan) -> np.ndarray:
+    """Return the names of the labels (rows, columns) at a scan's pixels, before what is not labelled is classified."""
     anatomy = patient.anatomy
-    names = _names_at(anatomy.labels, anatomy.tissues, anatomy.index_from_mm, scan)
-    grey = np.repeat(scan.ct[..., None], 3, axis=-1)
-    mixed = (1 - LABEL_SHARE) * grey + LABEL_SHARE * coloured(names)
-    return np.where((names == "")[..., None], grey, mixed).astype(np.uint8)
+    return _names_at(anatomy.labels, anatomy.tissues, anatomy.index_from_mm, scan)
 
 
 def coloured(names: np.ndarray) -> np.ndarray:
     """Return the colours (rows, columns, 3) uint8 of the names of tissues (rows, columns)."""
     known, index = np.unique(names, return_inverse=True)
     return np.array([COLOURS.get(name, UNCLASSIFIED) for name in known], np.uint8)[index.reshape(names.shape)]
+
+
+def _hex(name: str) -> str:
+    return "#" + bytes(COLOURS.get(name, UNCLASSIFIED)).hex()
+
+
+def _palette() -> Image.Image:
+    """Return an image with the palette of a sheet: grey values, and the colours of the classes."""
+    greys = np.linspace(0, 255, GREY_VALUES).round().astype(int)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(
+        [*np.repeat(greys, 3).tolist(), *(channel for colour in COLOURS.values() for channel in colour)]
+    )
+    return palette
 
 
 def _names_at(

@@ -1,5 +1,6 @@
 """Images of a patient's standard planes with a probe, each with its truth."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -71,11 +72,12 @@ class ImagedPatient:
         """The tissue of each voxel, as classified."""
         return self.anatomy.voxels
 
-    def scans(self, probe: Probe, pixels: int = PIXELS) -> list[PlaneScan]:
-        """Return the scans of the standard planes, at rest, with default settings, images of at most ``pixels`` x ``pixels``."""
-        scanner = Scanner(self.anatomy, Unmoved(), probe, pixels, "background", "tissue")
+    def scans(self, probe: Probe) -> Iterator[PlaneScan]:
+        """Yield the scans of the standard planes, at rest, with default settings."""
+        scanner = Scanner(self.anatomy, Unmoved(), probe, PIXELS, "background", "tissue")
         planes = standard_planes(self.anatomy.organ, self.scene.attachment.at_mm, probe)
-        return [self._scan(scanner, probe, name, pose) for name, pose in planes.items()]
+        for name, pose in planes.items():
+            yield self._scan(scanner, probe, name, pose)
 
     def _scan(self, scanner: Scanner, probe: Probe, name: str, pose: np.ndarray) -> PlaneScan:
         plane, image = ImagePlane(pose, *probe.extent_mm), self.scene.image

@@ -115,7 +115,7 @@ def _imaged_patient(path: Path) -> ImagedPatient:
 
 def _row(patient: ImagedPatient, number: int, name: str, probe: Probe, out: Path) -> Row:
     """Write the sheet of a patient and a probe; its figures."""
-    scans = patient.scans(probe)
+    scans = list(patient.scans(probe))
     title = patient.scene.title
     write_sheet(patient, scans, f"{number}: {title}, {name}", out / f"patient-{number}-{name}.png")
     scanlines = [scan.scanlines for scan in scans]

@@ -1,6 +1,7 @@
 """B-mode images of patients: figures of truths made by hand, a made CT, a real one where it is, and the command."""
 
 import json
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -400,7 +401,7 @@ def test_every_tissue_has_a_colour():
 
 
 @pytest.mark.skipif(not (DATA / "ct").is_dir(), reason="real data (../shared/data/ct) is not here")
-def test_a_real_kidneys_fat_is_brighter_than_it(device, monkeypatch):
+def test_a_real_kidneys_fat_is_brighter_than_it(device):
     """The unenhanced CT, two planes of eight."""
     ct = open_ct(DATA / "ct" / "totalseg/ct.nii.gz").image()
     labels = open_ct(DATA / "ct" / "totalseg/kidneys.nii.gz").image()
@@ -413,8 +414,7 @@ def test_a_real_kidneys_fat_is_brighter_than_it(device, monkeypatch):
     scene = Scene(anatomy=AnatomyFiles(organ="organ.stl"))
     patient, probe = ImagedPatient.of(scene, anatomy), load_probe("curvilinear")
     assert patient.truth.median_hu < 60
-    few = {"front, long axis", "back, short axis"}
-    scans = [scan for scan in patient.scans(probe) if scan.name in few]
+    scans = list(islice(patient.scans(probe), 2))
     assert picture_figures(scans)["fat_auc"] > 0.85
 
 
