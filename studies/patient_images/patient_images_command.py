@@ -45,7 +45,7 @@ NOISE_COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Row:
+class PatientImageRow:
     """Figures of one patient and probe, pooled over the standard planes (``picture_figures``, ``scanline_figures``); None where there is
     too little to judge.
     """
@@ -88,7 +88,7 @@ def patient_images(patients: tuple[Path, ...], names: tuple[str, ...], out: Path
     make_folder(out)
     probes = {Path(name).stem: load_probe(name) for name in names}
     backend = start_taichi("cpu")
-    rows: list[Row] = []
+    rows: list[PatientImageRow] = []
     with tqdm(total=len(patients) * len(probes), desc="patient-images", unit="sheet") as bar:
         for number, path in enumerate(patients, 1):
             patient = _imaged_patient(path)
@@ -113,14 +113,14 @@ def _imaged_patient(path: Path) -> ImagedPatient:
     return ImagedPatient.of(scene, anatomy)
 
 
-def _row(patient: ImagedPatient, number: int, name: str, probe: Probe, out: Path) -> Row:
+def _row(patient: ImagedPatient, number: int, name: str, probe: Probe, out: Path) -> PatientImageRow:
     """Write the sheet of a patient and a probe; its figures."""
     scans = list(patient.scans(probe))
     title = patient.scene.title
     write_sheet(patient, scans, f"{number}: {title}, {name}", out / f"patient-{number}-{name}.png")
     scanlines = [scan.scanlines for scan in scans]
     figures = picture_figures(scans) | capsule_figures(scanlines) | agent_figures(scanlines, patient.truth)
-    return Row(number, title, name, **{key: rounded(value) for key, value in figures.items()})
+    return PatientImageRow(number, title, name, **{key: rounded(value) for key, value in figures.items()})
 
 
 def _noise(name: str, probe: Probe) -> dict[str, str | float | None]:

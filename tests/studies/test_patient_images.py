@@ -427,4 +427,4 @@ def _index_from_mm(image):
 
 def test_the_columns_are_those_of_a_row():
     names = {form.strip("{}").split(":")[0] for _, form in patient_images_command.COLUMNS}
-    assert names == set(patient_images_command.Row.__dataclass_fields__)
+    assert names == set(patient_images_command.PatientImageRow.__dataclass_fields__)
