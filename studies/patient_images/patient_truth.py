@@ -13,6 +13,7 @@ from ultrasound.sampled_volume import AIR_HU, FAR_MM
 from ultrasound.scanner import ScannedAnatomy
 
 LESIONS = ("tumour", "cyst", "stone")
+PARENCHYMA = ("kidney", "cortex", "medulla")
 # Behind what has fewer or more HU, nothing is to be seen.
 GAS_HU, BONE_HU = -300.0, 300.0
 # A kidney whose median is above the first has taken up contrast agent; what is above the median by the second is the agent itself.
@@ -42,12 +43,13 @@ class Volume:
 class PatientTruth:
     """A patient at rest.
 
-    ``hu``; signed distances [mm], negative inside, from the labelled kidney with its lesions, from contrast agent in its collecting system,
-    and from the organ's surface. ``median_hu`` is that of the labelled kidney, ``voxel_mm`` the longest edge of the CT's voxels.
+    ``hu``; signed distances [mm], negative inside, from the labelled kidney with sinus and lesions as far as these are labelled, from its
+    parenchyma, from contrast agent in its collecting system, and from the organ's surface. ``median_hu`` is that of the parenchyma, ``voxel_mm`` the longest edge of the CT's voxels.
     """
 
     hu: Volume
     kidney_mm: Volume
+    parenchyma_mm: Volume
     agent_mm: Volume
     surface_mm: Volume
     median_hu: float
@@ -56,17 +58,19 @@ class PatientTruth:
     @classmethod
     def of(cls, anatomy: ScannedAnatomy) -> "PatientTruth":
         """Return that of an anatomy whose kidney is labelled."""
-        assert anatomy.labels is not None
-        own = [value for value, tissue in anatomy.tissues.items() if tissue in (*KIDNEY, *LESIONS)]
-        kidney = np.isin(anatomy.labels, own)
-        median = float(np.median(anatomy.hu[kidney]))
-        agent = contrast_agent(anatomy.hu, kidney, median)
+        kidney = _labelled(anatomy, *KIDNEY, *LESIONS)
+        parenchyma = _labelled(anatomy, *PARENCHYMA)
+        median = float(np.median(anatomy.hu[parenchyma]))
+        masks = kidney, parenchyma, contrast_agent(anatomy.hu, kidney, median)
         from_mm = anatomy.index_from_mm
-        kidney_mm, agent_mm = (signed_distance_of(each, anatomy.voxel_mm) for each in (kidney, agent))
+        kidney_mm, parenchyma_mm, agent_mm = (
+            Volume(signed_distance_of(mask, anatomy.voxel_mm), from_mm, FAR_MM) for mask in masks
+        )
         return cls(
             Volume(anatomy.hu, from_mm, AIR_HU),
-            Volume(kidney_mm, from_mm, FAR_MM),
-            Volume(agent_mm, from_mm, FAR_MM),
+            kidney_mm,
+            parenchyma_mm,
+            agent_mm,
             surface_distance(anatomy.organ),
             median,
             float(anatomy.voxel_mm.max()),
@@ -84,6 +88,12 @@ class PatientTruth:
         hard = (hu < GAS_HU) | ((hu > BONE_HU) & ~is_agent)
         first = np.where(hard.any(axis=1), depth[hard.argmax(axis=1)], np.inf)
         return ndimage.minimum_filter1d(first, 2 * SHADOW_SCANLINES + 1, mode="nearest")
+
+
+def _labelled(anatomy: ScannedAnatomy, *tissues: str) -> np.ndarray:
+    """Return whether the label of a voxel is one of some tissues."""
+    assert anatomy.labels is not None
+    return np.isin(anatomy.labels, [value for value, tissue in anatomy.tissues.items() if tissue in tissues])
 
 
 def contrast_agent(hu: np.ndarray, kidney: np.ndarray, median_hu: float) -> np.ndarray:

@@ -18,8 +18,8 @@ DEPTHS_MM = 4.0, 45.0
 class PictureTruth:
     """Masks (rows, columns) of an image's pixels.
 
-    ``kidney``: labelled as kidney or its lesion, at whatever depth, seen or not. ``seen``: reached by the scanlines, not behind gas, bone
-    or stones. The others are what of the seen at DEPTHS_MM, without contrast agent, is kidney (``judged_kidney``), not kidney but within
+    ``kidney``: labelled as kidney, its sinus or lesion, at whatever depth, seen or not. ``seen``: reached by the scanlines, not behind gas, bone
+    or stones. The others are what of the seen at DEPTHS_MM, without contrast agent, is parenchyma (``judged_kidney``), not kidney but within
     NEAR_MM of it (``surroundings``), and of these has FAT_HU (``fat``).
     """
 
@@ -45,7 +45,8 @@ def picture_truth(
     kidney = distance < 0
     surroundings = judged & ~kidney & (distance <= NEAR_MM)
     fat = surroundings & (hu >= FAT_HU[0]) & (hu <= FAT_HU[1])
-    return PictureTruth(kidney, seen, judged & kidney, surroundings, fat)
+    parenchyma = judged & (patient.parenchyma_mm.at(world) < 0)
+    return PictureTruth(kidney, seen, parenchyma, surroundings, fat)
 
 
 def pixel_places(probe: Probe, shape: tuple[int, int]) -> np.ndarray:

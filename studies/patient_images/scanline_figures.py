@@ -60,7 +60,7 @@ def _crossings(truth: ScanlineTruth) -> np.ndarray:
             continue
         deep, power, depth = deep[:end], truth.power[line, way][:end], truth.depth_mm[way][:end]
         beneath, control = deep >= INSIDE_MM[0], np.abs(deep - CONTROL_MM) <= CAPSULE_MM
-        is_kidney = (truth.kidney_mm[line, way][:end][beneath] < 0).all()
+        is_kidney = (truth.parenchyma_mm[line, way][:end][beneath] < 0).all()
         first = min(depth[0] - CAPSULE_MM, depth[-1])
         if not is_kidney or first < DEPTHS_MM[0] or not truth.seen[line, way][:end].all():
             continue
@@ -93,10 +93,10 @@ def agent_figures(truths: Sequence[ScanlineTruth], patient: PatientTruth) -> dic
         )
 
     def parenchyma(truth: ScanlineTruth) -> np.ndarray:
-        return (truth.kidney_mm < -UNDER_MM) & (np.abs(truth.hu - patient.median_hu) < PARENCHYMA_HU)
+        return (truth.parenchyma_mm < -UNDER_MM) & (np.abs(truth.hu - patient.median_hu) < PARENCHYMA_HU)
 
     elsewhere = chosen(lambda truth, behind: parenchyma(truth) & np.isinf(behind))
-    agent = chosen(lambda truth, behind: (truth.agent_mm < -CORE_MM) & (truth.kidney_mm < 0))
+    agent = chosen(lambda truth, behind: (truth.agent_mm < -CORE_MM) & (truth.parenchyma_mm < 0))
     after = chosen(
         lambda truth, behind: parenchyma(truth) & (behind >= BEHIND_MM[0]) & (behind <= BEHIND_MM[1])
     )

@@ -15,7 +15,7 @@ class ScanlineTruth:
     """Arrays (scanlines, samples) of one image, before the grey map, with gain and TGC.
 
     ``power`` is the mean square of the echo, linear. ``surface_mm`` is the signed distance of the sample's tissue from the organ's surface,
-    negative inside, ``incidence_deg`` the angle between scanline and normal of that surface. ``kidney_mm`` and ``agent_mm`` as
+    negative inside, ``incidence_deg`` the angle between scanline and normal of that surface. ``parenchyma_mm`` and ``agent_mm`` as
     ``PatientTruth``; ``seen`` is not behind gas, bone or stones. ``depth_mm`` (samples,).
     """
 
@@ -23,7 +23,7 @@ class ScanlineTruth:
     depth_mm: np.ndarray
     surface_mm: np.ndarray
     incidence_deg: np.ndarray
-    kidney_mm: np.ndarray
+    parenchyma_mm: np.ndarray
     agent_mm: np.ndarray
     hu: np.ndarray
     seen: np.ndarray
@@ -40,7 +40,7 @@ def scanline_truth(
         depth,
         patient.surface_mm.at(place),
         incidence_deg(patient, place, along),
-        patient.kidney_mm.at(place),
+        patient.parenchyma_mm.at(place),
         patient.agent_mm.at(place),
         patient.hu.at(place),
         depth < patient.hidden_from_mm(probe, world_from_plane)[:, None],
