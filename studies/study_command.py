@@ -45,6 +45,10 @@ STUDIES = {
         "studies.scanner.scanner_command:scanner",
         "Send echoes of real scanners through the B-mode and Doppler chain.",
     ),
+    "patient-images": (
+        "studies.patient_images.patient_images_command:patient_images",
+        "Show B-mode images of kidneys beside their CT, and measure what can be seen.",
+    ),
     "resection": (
         "studies.resection.resection_command:resection",
         "Measure margins, balance, random cuts and times of the resection.",

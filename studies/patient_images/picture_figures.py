@@ -1,41 +1,55 @@
-"""Figures of a B-mode image against the truth: whether the kidney's border can be seen, grey levels, and an outline by a segmenter."""
+"""Figures of B-mode images against the truth of their pixels: whether the kidney's border can be seen, grey levels, outlines."""
 
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import ndimage
 from scipy.stats import mannwhitneyu
 
-from studies.patient_images.picture_truth import PictureTruth
+from studies.image_quality import grey_figures
+from studies.patient_images.kidney_outline import GOOD_DICE, dice, kidney_contour, outlined_kidney
+from studies.patient_images.patient_image_scans import PlaneScan
 
-# Side of the square over which speckle is averaged.
-AVERAGED_MM = 3.0
 LEAST_PIXELS = 200
 
 
-def averaged(image: np.ndarray, covered: np.ndarray, pixel_mm: Sequence[float]) -> np.ndarray:
-    """Return an image averaged over a square of AVERAGED_MM, of pixels that the scanlines reach."""
-    size = [max(1, round(AVERAGED_MM / each)) for each in pixel_mm]
-    total = ndimage.uniform_filter(np.where(covered, image, 0).astype(np.float32), size)
-    return total / np.maximum(ndimage.uniform_filter(covered.astype(np.float32), size), 1e-6)
+def picture_figures(scans: Sequence[PlaneScan]) -> dict[str, float]:
+    """Return figures pooled over the planes of a patient and a probe.
+
+    ``fat_auc`` and ``surroundings_auc``: areas under the ROC curve of "brighter than kidney" (``PictureTruth``) of the averaged picture.
+    ``grey_median`` and ``grey_p90`` of all that the scanlines reach. ``outlined``: the share of planes that show kidney and whose outline has
+    a Dice of GOOD_DICE or more; ``all_kidney``: the same of an outline of the whole picture, which a narrow picture deserves.
+    """
+    kidney = _pooled([scan.averaged[scan.truth.judged_kidney] for scan in scans])
+    fat = _pooled([scan.averaged[scan.truth.fat] for scan in scans])
+    surroundings = _pooled([scan.averaged[scan.truth.surroundings] for scan in scans])
+    median, most = grey_figures(_pooled([scan.b_mode[scan.covered] for scan in scans]))
+    outlines = [outline_dice(scan) for scan in scans if (scan.truth.kidney & scan.truth.seen).any()]
+    good, whole = np.mean(np.array(outlines).reshape(-1, 2) >= GOOD_DICE, axis=0)
+    return dict(
+        fat_auc=roc_area(fat, kidney),
+        surroundings_auc=roc_area(surroundings, kidney),
+        grey_median=median,
+        grey_p90=most,
+        outlined=float(good),
+        all_kidney=float(whole),
+    )
+
+
+def outline_dice(scan: PlaneScan) -> tuple[float, float]:
+    """Return Dice of the segmenter's outline of the kidney, and of the whole picture as kidney, in what is seen."""
+    seen = scan.truth.seen
+    contour = kidney_contour(scan.truth.kidney & scan.covered, scan.pixel_mm) & scan.covered
+    centre = np.argwhere(contour & seen).mean(axis=0)
+    outline = outlined_kidney(scan.averaged, scan.covered, centre, scan.pixel_mm)
+    return dice(outline[seen], contour[seen]), dice(scan.covered[seen], contour[seen])
 
 
 def roc_area(brighter: np.ndarray, darker: np.ndarray) -> float:
-    """Return the area under the ROC curve of "brighter" (n,) above "darker" (m,); NaN of too few pixels."""
+    """Return the area under the ROC curve of "brighter" (n,) above "darker" (m,), ties one half; NaN of fewer than LEAST_PIXELS."""
     if min(len(brighter), len(darker)) < LEAST_PIXELS:
         return float("nan")
     return float(mannwhitneyu(brighter, darker).statistic / (len(brighter) * len(darker)))
 
 
-def contrast(images: Sequence[np.ndarray], truths: Sequence[PictureTruth]) -> dict[str, float]:
-    """Return areas under the ROC curve over several averaged images: fat, and all surroundings, brighter than kidney."""
-    kidney = np.concatenate([image[truth.kidney] for image, truth in zip(images, truths, strict=True)])
-    fat = np.concatenate([image[truth.fat] for image, truth in zip(images, truths, strict=True)])
-    around = np.concatenate([image[truth.surroundings] for image, truth in zip(images, truths, strict=True)])
-    return {"fat_auc": roc_area(fat, kidney), "surroundings_auc": roc_area(around, kidney)}
-
-
-def grey_levels(images: Sequence[np.ndarray], covered: np.ndarray) -> dict[str, float]:
-    """Return median and 90th percentile of the grey values of images that the scanlines reach."""
-    values = np.concatenate([image[covered] for image in images])
-    return {"grey_median": float(np.median(values)), "grey_p90": float(np.percentile(values, 90))}
+def _pooled(parts: Sequence[np.ndarray]) -> np.ndarray:
+    return np.concatenate(list(parts))

@@ -1,26 +1,30 @@
 """Standard planes of a renal scan: long and short axis from the front, the side and the back, the hilum and a pole."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import trimesh
 
 from scenes.kidney_axes import KidneyAxes, kidney_axes
-from scenes.scene import Scene
 from ultrasound.probe import Probe
 
-# Where neither the scene nor the surface shows a hilum, it faces this way.
-HILAR = np.array([0.0, -1.0, 0.0])
+# Where no hilum is known, the front is towards the patient's.
+ANTERIOR = np.array([0.0, -1.0, 0.0])
 # Width of the band of surface that the array's face rests on, across the image plane [mm].
 BAND_MM = 4.0
 
 
-def standard_planes(organ: trimesh.Trimesh, scene: Scene, probe: Probe) -> dict[str, np.ndarray]:
+def standard_planes(
+    organ: trimesh.Trimesh, hilum_mm: Sequence[float] | None, probe: Probe
+) -> dict[str, np.ndarray]:
     """Return the poses (4, 4) by name, PLUS's axes of a probe to patient (LPS, mm); the face touches the organ at rest.
 
-    Front and back are those of the kidney itself, across its polar axis and its hilum; the side is opposite the hilum.
+    Front and back are those of the kidney itself, across its polar axis and its hilum; the side is opposite the hilum. Where no hilum is
+    known, which of the two sides it is is not known either, and the plane of the hilum passes through the centre.
     """
-    axes = kidney_axes(organ, [], {}, scene.attachment.at_mm)
+    axes = kidney_axes(organ, [], {}, hilum_mm)
     polar, hilar, front = _directions(axes)
-    hilum = axes.centre if scene.attachment.at_mm is None else np.asarray(scene.attachment.at_mm, float)
+    hilum = axes.centre if hilum_mm is None else np.asarray(hilum_mm, float)
     aslant = (front + hilar) / np.sqrt(2)
     beams = {
         "front, long axis": (-front, polar, axes.centre),
@@ -37,14 +41,11 @@ def standard_planes(organ: trimesh.Trimesh, scene: Scene, probe: Probe) -> dict[
 
 def _directions(axes: KidneyAxes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return unit vectors (3,) to the upper pole, to the hilum and to the front."""
-    polar, hilar = axes.polar, axes.hilar
-    if hilar is None:
-        hilar = HILAR - (HILAR @ polar) * polar
-        hilar = hilar / np.linalg.norm(hilar)
-        front = np.cross(polar, hilar)
-    else:
-        front = np.asarray(axes.anterior)
-    return polar, hilar, front
+    if axes.hilar is not None and axes.anterior is not None:
+        return axes.polar, axes.hilar, axes.anterior
+    front = ANTERIOR - (ANTERIOR @ axes.polar) * axes.polar
+    front /= np.linalg.norm(front)
+    return axes.polar, np.cross(axes.polar, front), front
 
 
 def _touching(
