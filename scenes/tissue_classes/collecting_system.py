@@ -1,4 +1,4 @@
-"""Dense pieces in a kidney: contrast agent in its collecting system, or stones, by contrast phase and size.
+"""The collecting system: contrast agent in it, or stones, by contrast phase and size; and a pelvis with urine alone, by HU and shape.
 
 Excreted contrast agent has 200 to more than 1000 HU, stones have 200 to 1500: HU alone cannot tell them apart. In an enhanced kidney a dense
 piece is taken for contrast agent; a stone in it cannot be seen, and has to be labelled.
@@ -17,6 +17,12 @@ DENSE_ABOVE_HU, BESIDE_ABOVE_HU, BESIDE_VOXELS = 130.0, 50.0, 2
 LARGEST_STONE_ML = 3.0
 # A dense piece belongs to a kidney with this share of its volume: pelvis and ureter continue outside, bones do not begin inside.
 LEAST_SHARE = 0.2
+# So small a piece belongs to it if it only begins inside.
+SMALL_ML = 20.0
+# Urine without contrast agent: its HU beside enhanced parenchyma, and against the median of parenchyma without. A pelvis that is seen contains a ball of
+# this radius and has this volume, reaches into the kidney's hollow, and is no farther from its outer surface than this.
+URINE_HU, URINE_AGAINST_MEDIAN_HU = (-10.0, 35.0), (-35.0, -8.0)
+PELVIS_MM, LEAST_PELVIS_ML, EXTRARENAL_MM = 4.0, 1.0, 14.0
 
 
 @dataclass(frozen=True)
@@ -42,9 +48,36 @@ def dense_pieces(hu: np.ndarray, parenchyma: np.ndarray, kidney: np.ndarray, vox
     pieces, count = ndimage.label(dense, np.ones((3, 3, 3)))
     sizes = np.bincount(pieces.ravel(), minlength=count + 1)
     inside = np.bincount(pieces[kidney], minlength=count + 1)
-    own = inside >= np.maximum(LEAST_SHARE * sizes, 1)
+    least = np.where(is_enhanced & (sizes * voxel_ml < SMALL_ML), 1, LEAST_SHARE * sizes)
+    own = inside >= np.maximum(least, 1)
     own[0] = False
     is_urine = own & (is_enhanced | (inside * voxel_ml > LARGEST_STONE_ML))
     urine = is_urine[pieces]
     beside = ndimage.maximum_filter(urine, 2 * BESIDE_VOXELS + 1) & kidney & (hu > median + BESIDE_ABOVE_HU)
     return DensePieces(urine | beside, (own & ~is_urine)[pieces], is_enhanced)
+
+
+def pelvis_without_agent(
+    hu: np.ndarray, parenchyma: np.ndarray, kidney: np.ndarray, outer_mm: np.ndarray, spacing_mm: np.ndarray
+) -> np.ndarray:
+    """Return a mask (nx, ny, nz) of a renal pelvis with urine alone; one that is not dilated is not seen by HU.
+
+    Args:
+        hu: smoothed.
+        parenchyma: whose HU decide whether there is contrast agent.
+        kidney: what is no pelvis.
+        outer_mm: distance from the kidney's outer surface, its hollow filled, which is where this is negative.
+    """
+    median = median_hu(hu, parenchyma)
+    low, high = URINE_HU if median > ENHANCED_FROM_HU else (median + off for off in URINE_AGAINST_MEDIAN_HU)
+    body = (hu > low) & (hu < high) & ~kidney & (outer_mm < EXTRARENAL_MM)
+    core = ndimage.distance_transform_edt(body, sampling=spacing_mm) >= PELVIS_MM
+    if not core.any():
+        return core
+    opened = body & (ndimage.distance_transform_edt(~core, sampling=spacing_mm) <= PELVIS_MM)
+    pieces, count = ndimage.label(opened)
+    volumes = np.bincount(pieces.ravel(), minlength=count + 1) * float(np.prod(spacing_mm)) / 1000
+    reaches = np.bincount(pieces[outer_mm < 0], minlength=count + 1) > 0
+    chosen = reaches & (volumes >= LEAST_PELVIS_ML)
+    chosen[0] = False
+    return chosen[pieces]

@@ -14,7 +14,7 @@ COLUMN_MM, PAPILLA_SHARE = 2.5, 0.4
 # A pyramid is at least so high.
 LEAST_HEIGHT_MM = 4.0
 # The fascia: in fat, so far from what is behind it, at least so far from the kidney and no farther than the third value.
-BEFORE_MM, LEAST_MM, MOST_MM = 3.0, 4.0, 20.0
+BEFORE_MM, LEAST_MM, MOST_MM, OPENED_VOXELS = 3.0, 4.0, 20.0, 3
 # Sheets of perimysium in muscle: distance, and where they are, as a threshold of noise of unit SD smoothed over this distance.
 SHEETS_MM, SHEETS_ABOVE, SHEETS_OVER_MM, SEED = 4.0, -0.2, 4.0, 20151124
 
@@ -67,7 +67,9 @@ def draw_fascia(
     fat: np.ndarray, others: np.ndarray, from_kidney_mm: np.ndarray, spacing_mm: np.ndarray
 ) -> np.ndarray:
     """Return the renal fascia (nx, ny, nz): a sheet in the perirenal fat, one voxel thick, before what is behind the fat."""
-    sheet = np.abs(coarse_distance(~others, spacing_mm) - BEFORE_MM) <= 0.5 * float(spacing_mm.max())
+    # Islands are nothing that fat has its fascia before.
+    behind = ndimage.binary_opening(others, iterations=OPENED_VOXELS)
+    sheet = np.abs(coarse_distance(~behind, spacing_mm) - BEFORE_MM) <= 0.5 * float(spacing_mm.max())
     return fat & sheet & (from_kidney_mm > LEAST_MM) & (from_kidney_mm < MOST_MM)
 
 

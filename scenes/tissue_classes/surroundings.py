@@ -19,6 +19,7 @@ BEFORE_SPINE_MM, SHELL_MM, SOLID_SHARE = 15.0, 2.5, 0.1
 LIVER_ABOVE_HU, FLUID_BELOW_HU = 88.0, 32.0
 # Large bodies of soft tissue are searched in cells of this size; they contain a ball of the first radius, liver and spleen of the second.
 CELL_MM, BODY_MM, ORGAN_MM = 3.0, 7.0, 12.0
+BODIES = ("muscle", "liver", "spleen")
 # Without contrast agent, muscle is behind or beside the spine: so far behind the kidney's middle, so near to the spine's.
 BEHIND_MM, BESIDE_SPINE_MM = 25.0, 45.0
 # Soft tissue so near to gas is bowel.
@@ -152,9 +153,16 @@ def _bodies(hu: np.ndarray, soft: np.ndarray, bone: np.ndarray, place: Place) ->
         level = float(np.median(mean[own & (depth > depth[own].max() / 3)]))
         at = place.of_indices(_middle(own, step))[0]
         names.append(_body(level, float(depth[tuple(peak)]), at, spine, place.is_enhanced))
-    found = np.array([("muscle", "liver", "spleen").index(n) + 1 if n != "soft-tissue" else 0 for n in names])
-    codes = _repeated(found[basins].astype(np.uint8), step, soft.shape)
-    return {name: soft & (codes == code) for code, name in enumerate(("muscle", "liver", "spleen"), 1)}
+    found = np.array([("soft-tissue", *BODIES).index(name) for name in names])[basins]
+    for code in (BODIES.index(name) + 1 for name in ("liver", "spleen")):
+        # What no ball fits into is the wall of the abdomen beside it.
+        core = (found == code) & (depth > BODY_MM)
+        beside = (found == code) & (
+            ndimage.distance_transform_edt(~core, sampling=cell_mm) > BODY_MM + CELL_MM
+        )
+        found[beside] = BODIES.index("muscle") + 1
+    codes = _repeated(found.astype(np.uint8), step, soft.shape)
+    return {name: soft & (codes == code) for code, name in enumerate(BODIES, 1)}
 
 
 def _spine(bone: np.ndarray, step: np.ndarray, place: Place) -> np.ndarray | None:

@@ -12,7 +12,7 @@ import trimesh
 from scipy import ndimage
 
 from scenes.tissue_classes.bones import bones
-from scenes.tissue_classes.collecting_system import DensePieces, dense_pieces
+from scenes.tissue_classes.collecting_system import DensePieces, dense_pieces, pelvis_without_agent
 from scenes.tissue_classes.drawn_anatomy import MOST_MM, draw_fascia, draw_perimysium, draw_pyramids
 from scenes.tissue_classes.fine_grid import (
     FAR_MM,
@@ -142,7 +142,8 @@ def tissue_map(
     drawn = np.zeros(own.shape, bool)
     kidney = shape.inside & np.isin(own[box], [0, CODE["kidney"]])
     _write(codes[box], kidney_parts(smooth[box], kidney, shape.hollow, -shape.outer_mm))
-    _write(codes[box], {"urine": dense.urine})
+    pelvis = pelvis_without_agent(smooth[box], kidney, shape.inside, shape.outer_mm, place.spacing_mm)
+    _write(codes[box], {"urine": dense.urine | (pelvis & ~of_tissues(codes[box], "bone"))})
     if draws:
         drawn[box] = _draw(codes[box], kidney, shape, place.spacing_mm)
         layers = draw_perimysium(of_tissues(codes, "muscle"), place.spacing_mm)
