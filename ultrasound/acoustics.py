@@ -197,7 +197,7 @@ def _variation(hu: np.ndarray, codes: np.ndarray, names: list[str], spacing_mm: 
     follows = np.zeros(len(names), np.float32)
     for n, name in enumerate(names[1:], 1):
         median[n] = np.median(hu[codes == n])
-        follows[n] = tissue_table()[name].get("follows_hu", False)
+        follows[n] = tissue_table()[name].get("follows_hu", 0.0)
     most = np.float32(MOST_OF_HU_DB / DB_OF_HU)
     off = np.clip(hu.astype(np.float32) - median[codes], -most, most) * follows[codes]
     return np.float32(DB_OF_HU) * ndimage.gaussian_filter(off, OF_HU_MM / spacing_mm, truncate=2)
