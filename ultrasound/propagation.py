@@ -184,13 +184,19 @@ class Propagation:
         for k in range(count):
             planes = ti.static(THICK_PLANE if thick else CENTRAL_PLANE)
             found = self.tissue_at(planes, self.start[line] + depth * self.direction[line], self.slice_sd[k])
-            distance, is_parenchyma = self.organ.sample(found.rest), found.tissue.w > 0.5
             self.capsule[line, k] = tm.vec4(0.0)
-            if k > 0 and distance * before < 0.0 and (is_parenchyma or parenchyma_before):
-                self.add_capsule(line, k, found, before / (before - distance), step_mm)
-            before, parenchyma_before = distance, is_parenchyma
+            is_parenchyma = found.tissue.w > 0.5
+            if k > 0 and (is_parenchyma or parenchyma_before):
+                distance = self.organ.sample(found.rest)
+                if not parenchyma_before:
+                    before = self.organ.sample(self.rest[line, k - 1])
+                if distance * before < 0.0:
+                    self.add_capsule(line, k, found, before / (before - distance), step_mm)
+                before = distance
+            parenchyma_before = is_parenchyma
             if ti.static(self.has_fluid):
                 if in_front:
+                    distance = self.organ.sample(found.rest)
                     in_front = distance > 0.0
                     if in_front and distance <= self.gap_mm and found.tissue.x > LEAST_FLUID_MRAYL:
                         found.tissue = tm.vec4(self.fluid)

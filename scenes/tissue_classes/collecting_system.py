@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from scenes.tissue_classes.fine_grid import coarse_distance
 from scenes.tissue_classes.kidney_parts import ENHANCED_FROM_HU, median_hu
 
 # So much brighter than parenchyma is dense; voxels beside contrast agent have more than the second value by partial volume.
@@ -71,10 +72,10 @@ def pelvis_without_agent(
     median = median_hu(hu, parenchyma)
     low, high = URINE_HU if median > ENHANCED_FROM_HU else (median + off for off in URINE_AGAINST_MEDIAN_HU)
     body = (hu > low) & (hu < high) & ~kidney & (outer_mm < EXTRARENAL_MM)
-    core = ndimage.distance_transform_edt(body, sampling=spacing_mm) >= PELVIS_MM
+    core = coarse_distance(body, spacing_mm) >= PELVIS_MM
     if not core.any():
         return core
-    opened = body & (ndimage.distance_transform_edt(~core, sampling=spacing_mm) <= PELVIS_MM)
+    opened = body & (coarse_distance(~core, spacing_mm) <= PELVIS_MM)
     pieces, count = ndimage.label(opened)
     volumes = np.bincount(pieces.ravel(), minlength=count + 1) * float(np.prod(spacing_mm)) / 1000
     reaches = np.bincount(pieces[outer_mm < 0], minlength=count + 1) > 0

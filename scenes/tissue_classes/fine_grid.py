@@ -10,7 +10,7 @@ from scipy import ndimage
 from scenes.surfaces import signed_distance_from
 
 # Voxels are divided until they are no longer than this.
-LONGEST_MM = 1.6
+LONGEST_MM = 1.7
 # Distances from the organ's surface are computed at this spacing, and interpolated.
 SURFACE_MM = 3.0
 # Distances within large bodies are computed in cells of this size.
