@@ -22,8 +22,8 @@ LEAST_SHARE = 0.2
 SMALL_ML = 20.0
 # Urine without contrast agent: its HU beside enhanced parenchyma, and against the median of parenchyma without. A pelvis that is seen contains a ball of
 # this radius and has this volume, reaches into the kidney's hollow, and is no farther from its outer surface than this.
-URINE_HU, URINE_AGAINST_MEDIAN_HU = (-10.0, 35.0), (-35.0, -8.0)
-PELVIS_MM, LEAST_PELVIS_ML, EXTRARENAL_MM = 4.0, 1.0, 14.0
+URINE_HU, URINE_AGAINST_MEDIAN_HU = (-10.0, 35.0), (-27.0, -8.0)
+PELVIS_MM, LEAST_PELVIS_ML, EXTRARENAL_MM = 5.0, 1.0, 14.0
 
 
 @dataclass(frozen=True)

@@ -5,14 +5,16 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from scenes.patients import import_warnings
 from scenes.tissue_classes.collecting_system import (
     BESIDE_ABOVE_HU,
     DENSE_ABOVE_HU,
     LARGEST_STONE_ML,
     LEAST_SHARE,
+    PELVIS_MM,
+    SMALL_ML,
     DensePieces,
     dense_pieces,
+    pelvis_without_agent,
 )
 
 SHAPE, VOXEL_ML = (60, 50, 40), 0.001
@@ -85,8 +87,35 @@ def test_a_piece_belongs_to_a_kidney_that_holds_enough_of_it_and_continues_outsi
         piece = box((50 - inside, 60 - inside), (24, 27), (18, 21))
         hu = kidney_of(level, piece, 300.0)
         given = (each.transpose(turn) for each in (hu, PARENCHYMA, KIDNEY))
-        found = getattr(pieces(*given), kind)
-        assert (found == (piece & is_own).transpose(turn)).all()
+        # Of voxels so large that the rod is no small piece.
+        found = pieces(*given, voxel_ml=1.1 * SMALL_ML / piece.sum())
+        one = found.urine | found.stone if kind == "stone" else found.urine
+        assert (one == (piece & is_own).transpose(turn)).all()
+
+
+@pytest.mark.parametrize("times, is_own", [(0.9, True), (1.1, False)])
+def test_contrast_agent_in_a_small_piece_only_begins_in_the_kidney(times, is_own):
+    piece = box((49, 59), (24, 27), (18, 21))
+    hu, voxel_ml = kidney_of(ENHANCED, piece, 300.0), times * SMALL_ML / piece.sum()
+    assert (pieces(hu, voxel_ml=voxel_ml).urine == (piece & is_own)).all()
+    # A rib beside an unenhanced kidney is no stone.
+    assert not pieces(kidney_of(PLAIN, piece, 300.0), voxel_ml=voxel_ml).stone.any()
+
+
+@pytest.mark.parametrize("level, urine", [(PLAIN, 12.0), (ENHANCED, 8.0)])
+def test_a_dilated_pelvis_without_contrast_agent_is_fluid_and_a_narrow_one_is_not_seen(level, urine):
+    outer = np.where(KIDNEY, -1.0, 1.0 + np.abs(AT[..., 0] - 50))
+    for radius, is_seen in ((8.0, True), (PELVIS_MM - 1.5, False)):
+        away = np.linalg.norm(AT - [50.0, 25.0, 20.0], axis=-1)
+        pelvis = (away <= radius) & ~PARENCHYMA
+        hu = np.where(pelvis, urine, np.where(PARENCHYMA, level, -90.0)).astype(np.float32)
+        found = pelvis_without_agent(hu, PARENCHYMA, PARENCHYMA, outer, np.ones(3))
+        assert not (found & ~pelvis).any()
+        # Cells of 2 mm leave up to one of them out at the rim.
+        assert (found.sum() > 0.7 * pelvis.sum()) if is_seen else not found.any()
+    # Blood and bowel beside it are no urine, nor is what does not reach the hollow.
+    assert not pelvis_without_agent(hu + 60, PARENCHYMA, PARENCHYMA, outer, np.ones(3)).any()
+    assert not pelvis_without_agent(hu, PARENCHYMA, PARENCHYMA, np.maximum(outer, 0.5), np.ones(3)).any()
 
 
 def test_a_dense_piece_outside_a_kidney_is_none_of_its():
@@ -121,7 +150,3 @@ def test_without_parenchyma_nothing_breaks():
         kidney_of(PLAIN, box((1, 2), (1, 2), (1, 2)), 0.0), np.zeros(SHAPE, bool), np.zeros(SHAPE, bool)
     )
     assert not (found.urine.any() or found.stone.any() or found.is_enhanced)
-
-
-def test_an_import_warns_from_the_same_hu_on():
-    assert import_warnings.STONE_ABOVE_MEDIAN_HU == DENSE_ABOVE_HU
