@@ -201,7 +201,7 @@ def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys, monkeypat
     assert np.array(row["probe_to_patient"]) == pytest.approx(pose_on_tumour())
     # Without contact there is electronic noise, and the vibration of the array near its face.
     assert (
-        shown["on-b-mode"].mean() > 20 and shown["off-b-mode"][100:].mean() < 3 and shown["off-ct"].max() > 0
+        shown["on-b-mode"].mean() > 10 and shown["off-b-mode"][100:].mean() < 3 and shown["off-ct"].max() > 0
     )
     assert (out / "on-b-mode.dcm").is_file() and not (out / "on-ct.dcm").exists()
     # Where Doppler shows nothing, it is the B-mode image.

@@ -185,7 +185,8 @@ def test_images_of_different_steering_have_independent_speckle(scattering):
         b_mode(scattering, PROBE.model_copy(update=settings | {"steering_deg": angle}))
         for angle in (0.0, 0.25)
     )
-    middle = slice(4, 20), slice(24, 40)
+    # In front of the capsule, which is where it is at any angle.
+    middle = slice(4, 12), slice(24, 40)
     # Turned by a quarter of a degree, the same scatterers would be seen alike.
     apart = (np.diff(each[middle], axis=0).ravel() for each in (first, second))
     assert abs(np.corrcoef(*apart)[0, 1]) < 0.3
