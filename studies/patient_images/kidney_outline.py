@@ -27,7 +27,7 @@ def outlined_kidney(
     """Return the mask (rows, columns) of the kidney in an image whose speckle is averaged.
 
     Args:
-        image: levels (rows, columns), linear in dB: a steep grey map hides fluid from parenchyma.
+        image: grey values (rows, columns).
         covered: whether the scanlines reach a pixel.
         centre: row and column of the kidney's centre, all that is known of it.
         pixel_mm: height and width of a pixel.

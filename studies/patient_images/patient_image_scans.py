@@ -16,7 +16,7 @@ from studies.patient_images.picture_truth import PictureTruth, picture_truth
 from studies.patient_images.scanline_truth import ScanlineTruth, scanline_truth
 from studies.patient_images.standard_planes import standard_planes
 from ultrasound.acoustics import TissueVoxels
-from ultrasound.probe import GREY_EXPONENTS, Probe
+from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import ImagePlane
 from ultrasound.scanner import B_MODE, CT, ScannedAnatomy, Scanner
 
@@ -47,18 +47,8 @@ class PlaneScan:
     @cached_property
     def averaged(self) -> np.ndarray:
         """The B-mode image, averaged over a square of AVERAGED_MM, of pixels that the scanlines reach."""
-        return self._averaged(self.b_mode.astype(np.float32))
-
-    @cached_property
-    def averaged_level(self) -> np.ndarray:
-        """As ``averaged``, of the image with its grey map undone: 0 to 1 over the dynamic range, linear in dB."""
-        return self._averaged(
-            (self.b_mode / 255).astype(np.float32) ** (1 / GREY_EXPONENTS[self.probe.grey_map])
-        )
-
-    def _averaged(self, image: np.ndarray) -> np.ndarray:
         size = [max(1, round(AVERAGED_MM / mm)) for mm in self.pixel_mm]
-        total = ndimage.uniform_filter(np.where(self.covered, image, 0), size)
+        total = ndimage.uniform_filter(np.where(self.covered, self.b_mode, 0).astype(np.float32), size)
         return total / np.maximum(ndimage.uniform_filter(self.covered.astype(np.float32), size), 1e-6)
 
 

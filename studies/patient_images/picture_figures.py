@@ -40,7 +40,7 @@ def outline_dice(scan: PlaneScan) -> tuple[float, float]:
     seen = scan.truth.seen
     contour = kidney_contour(scan.truth.kidney & scan.covered, scan.pixel_mm) & scan.covered
     centre = np.argwhere(contour & seen).mean(axis=0)
-    outline = outlined_kidney(scan.averaged_level, scan.covered, centre, scan.pixel_mm)
+    outline = outlined_kidney(scan.averaged, scan.covered, centre, scan.pixel_mm)
     return dice(outline[seen], contour[seen]), dice(scan.covered[seen], contour[seen])
 
 
