@@ -56,7 +56,7 @@ def dense_findings(
         kidney = f"kidney {level_hu:.0f} HU: {'enhanced' if is_enhanced else 'unenhanced'}"
         agent = (
             "contrast agent in the collecting system",
-            "fluid; a stone in it cannot be told from it: label it (--stones)",
+            "fluid; a stone in it cannot be distinguished: label it (--stones)",
         )
         large = (
             f"dense, in a piece of more than {LARGEST_STONE_ML:g} ml",

@@ -1,11 +1,7 @@
 """Parts of a kidney that nobody labelled, by HU, depth and contrast phase: sinus, vessels of the hilum, cortex and medulla."""
 
-from typing import Literal
-
 import numpy as np
 from scipy import ndimage
-
-Phase = Literal["unenhanced", "corticomedullary", "nephrographic", "excretory"]
 
 # Parenchyma above this has contrast agent: without, it has 30 to 50 HU.
 ENHANCED_FROM_HU = 75.0

@@ -263,8 +263,10 @@ def with_information(new, image):
 
 def test_a_class_image_alone_is_no_organ(files, first, tmp_path, capsys):
     assert main(["import", str(files[0]), str(first[1]), "--out", str(tmp_path / "a")]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1 and "class image alone" in told and "give the kidney's labels" in told
+    message = capsys.readouterr().err
+    assert (
+        message.count("\n") == 1 and "class image alone" in message and "give the kidney's labels" in message
+    )
 
 
 def test_what_was_drawn_in_a_corrected_tissue_is_corrected_with_it(tmp_path):

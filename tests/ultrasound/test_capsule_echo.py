@@ -43,7 +43,7 @@ def tank(taichi) -> Tank:
 def fill_ball(
     tank: Tank, impedance=USUAL, backscatter=0.0, anisotropy=PARENCHYMA, middle: float = TOP + RADIUS
 ) -> None:
-    """A ball in gel of its own impedance, of a tissue that is told by its anisotropy."""
+    """A ball in gel of its own impedance, of a tissue with an anisotropy."""
     fill((tank.bmode.sound.organ.voxels, distances(middle).ravel()))
 
     def inside(value):
