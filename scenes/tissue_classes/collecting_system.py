@@ -20,6 +20,8 @@ LARGEST_STONE_ML = 3.0
 LEAST_SHARE = 0.2
 # So small a piece belongs to it if it only begins inside.
 SMALL_ML = 20.0
+# A piece of bone with this share of contrast agent is none: where bones are searched, small gaps are closed.
+AGENT_SHARE = 0.2
 # Urine without contrast agent: its HU beside enhanced parenchyma, and against the median of parenchyma without. A pelvis that is seen contains a ball of
 # this radius and has this volume, reaches into the kidney's hollow, and is no farther from its outer surface than this.
 URINE_HU, URINE_AGAINST_MEDIAN_HU = (-10.0, 35.0), (-27.0, -8.0)
@@ -56,6 +58,16 @@ def dense_pieces(hu: np.ndarray, parenchyma: np.ndarray, kidney: np.ndarray, vox
     urine = is_urine[pieces]
     beside = ndimage.maximum_filter(urine, 2 * BESIDE_VOXELS + 1) & kidney & (hu > median + BESIDE_ABOVE_HU)
     return DensePieces(urine | beside, (own & ~is_urine)[pieces], is_enhanced)
+
+
+def agent_in_bone(bone: np.ndarray, urine: np.ndarray) -> np.ndarray:
+    """Return the pieces (nx, ny, nz) of what was taken for bone, but is contrast agent of the collecting system, and what is around it."""
+    pieces, count = ndimage.label(bone)
+    sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+    own = np.bincount(pieces[urine], minlength=count + 1)
+    is_agent = own > AGENT_SHARE * sizes
+    is_agent[0] = False
+    return is_agent[pieces]
 
 
 def pelvis_without_agent(

@@ -4,6 +4,7 @@ Without it, the border of an organ in slices of 5 mm is a stair, and each of its
 """
 
 import numpy as np
+import SimpleITK as sitk
 import trimesh
 from scipy import ndimage
 
@@ -113,15 +114,17 @@ class SurfaceGrid:
         self.distance = signed_distance_from(surface, points.reshape(-1, 3)).reshape(counts)
 
     def at_voxels(self, values: np.ndarray, box: Box, index_from_mm: np.ndarray) -> np.ndarray:
-        """Return values of this grid at the voxels of a box, float32; of the nearest point outside it."""
+        """Return values of this grid at the voxels of a box, float32, linear between points; of the nearest point outside the grid."""
         mm_from_index = np.linalg.inv(index_from_mm)
-        to_grid = mm_from_index[:3, :3] / SURFACE_MM
         first = mm_from_index[:3, :3] @ [a.start for a in box] + mm_from_index[:3, 3]
-        return ndimage.affine_transform(
-            values.astype(np.float32),
-            to_grid,
-            (first - self.low) / SURFACE_MM,
-            output_shape=tuple(a.stop - a.start for a in box),
-            order=1,
-            mode="nearest",
+        # In indices of both grids, whose spacing is 1 for SimpleITK.
+        to_grid = sitk.AffineTransform(
+            (mm_from_index[:3, :3] / SURFACE_MM).ravel().tolist(), ((first - self.low) / SURFACE_MM).tolist()
         )
+        resampler = sitk.ResampleImageFilter()
+        resampler.SetSize([int(a.stop - a.start) for a in box])
+        resampler.SetTransform(to_grid)
+        resampler.SetInterpolator(sitk.sitkLinear)
+        resampler.SetUseNearestNeighborExtrapolator(True)
+        image = sitk.GetImageFromArray(np.ascontiguousarray(values.T, np.float32))
+        return np.ascontiguousarray(sitk.GetArrayFromImage(resampler.Execute(image)).T)

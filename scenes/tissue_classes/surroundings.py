@@ -62,7 +62,7 @@ def surroundings(
     soft = ~(bone | gas | fat | kidney)
     masks = {"soft-tissue": soft, "fat": fat, "gas": gas}
     masks |= _bodies(hu, soft, bone, place)
-    masks["bowel"] = soft & _near(gas & ~_open_air(gas), BOWEL_WALL_MM, place.spacing_mm) & ~masks["muscle"]
+    masks["bowel"] = soft & _near(gas & ~_open_air(gas), BOWEL_WALL_MM, place) & ~masks["muscle"]
     if place.is_enhanced:
         vessel = soft & (hu > BLOOD_ABOVE_HU) & (hu < DENSE_ABOVE_HU)
         vessel[near] &= ~beside
@@ -74,19 +74,27 @@ def surroundings(
 def _oral_agent(hu: np.ndarray, bone: np.ndarray, place: Place) -> np.ndarray:
     """Return what was taken for bone, but is contrast agent in the bowel: in front of the spine, and solid, where a bone is a shell."""
     agent = np.zeros(bone.shape, bool)
-    spine = _spine(bone, np.ones(3), place)
+    step = _cell_voxels(place)
+    spine = _spine(block_reduce(bone, tuple(step), np.mean) >= 0.5, step, place)
+    if spine is None:
+        return agent
     pieces, _ = ndimage.label(bone)
     for n, box in enumerate(ndimage.find_objects(pieces), 1):
         piece = pieces[box] == n
         bright = piece & (hu[box] > DENSE_ABOVE_HU)
-        if spine is None or not bright.any():
+        if not bright.any():
             continue
-        at = place.of_indices(np.argwhere(bright).mean(axis=0)[None] + [axis.start for axis in box])[0]
-        if at[1] < spine[1] - BEFORE_SPINE_MM:
+        middle = _middle(bright, np.ones(3)) + [axis.start for axis in box]
+        if place.of_indices(middle)[0, 1] < spine[1] - BEFORE_SPINE_MM:
             depth = ndimage.distance_transform_edt(np.pad(bright, 1), sampling=place.spacing_mm)
             if (depth > SHELL_MM).sum() > SOLID_SHARE * bright.sum():
                 agent[box] |= piece
     return agent
+
+
+def _cell_voxels(place: Place) -> np.ndarray:
+    """Return how many voxels (3,) a cell of about CELL_MM has along each axis."""
+    return np.maximum(np.rint(CELL_MM / place.spacing_mm), 1).astype(int)
 
 
 def _marrow(hu: np.ndarray, bone: np.ndarray, kidney: np.ndarray, place: Place) -> np.ndarray:
@@ -121,13 +129,13 @@ def _open_air(gas: np.ndarray) -> np.ndarray:
     return at_border[parts]
 
 
-def _near(mask: np.ndarray, distance_mm: float, spacing_mm: np.ndarray) -> np.ndarray:
+def _near(mask: np.ndarray, distance_mm: float, place: Place) -> np.ndarray:
     """Return what is within a distance of a mask, by steps of voxels."""
     if not mask.any():
         return mask
-    step = np.maximum(np.rint(CELL_MM / spacing_mm), 1).astype(int)
+    step = _cell_voxels(place)
     coarse = block_reduce(mask, tuple(step), np.max)
-    near = ndimage.distance_transform_edt(~coarse, sampling=spacing_mm * step) <= distance_mm
+    near = ndimage.distance_transform_edt(~coarse, sampling=place.spacing_mm * step) <= distance_mm
     return _repeated(near, step, mask.shape)
 
 
@@ -138,7 +146,7 @@ def _repeated(coarse: np.ndarray, step: np.ndarray, shape: tuple[int, ...]) -> n
 
 def _bodies(hu: np.ndarray, soft: np.ndarray, bone: np.ndarray, place: Place) -> dict[str, np.ndarray]:
     """Return liver, spleen and muscle: soft tissue in large bodies."""
-    step = np.maximum(np.rint(CELL_MM / place.spacing_mm), 1).astype(int)
+    step = _cell_voxels(place)
     cell_mm = place.spacing_mm * step
     mean, inside = block_reduce(hu, tuple(step), np.mean), block_reduce(soft, tuple(step), np.mean) >= 0.5
     depth = ndimage.gaussian_filter(ndimage.distance_transform_edt(inside, sampling=cell_mm), 1.0)

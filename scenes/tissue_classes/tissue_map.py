@@ -12,7 +12,12 @@ import trimesh
 from scipy import ndimage
 
 from scenes.tissue_classes.bones import bones
-from scenes.tissue_classes.collecting_system import DensePieces, dense_pieces, pelvis_without_agent
+from scenes.tissue_classes.collecting_system import (
+    DensePieces,
+    agent_in_bone,
+    dense_pieces,
+    pelvis_without_agent,
+)
 from scenes.tissue_classes.drawn_anatomy import MOST_MM, draw_fascia, draw_perimysium, draw_pyramids
 from scenes.tissue_classes.fine_grid import (
     FAR_MM,
@@ -132,6 +137,7 @@ def tissue_map(
     bone = refined(bones(hu, spacing) & (labels == 0), factors) > 0.5
     box = shape.box
     dense = _dense(sharp[box], own[box], shape, float(np.prod(spacing / factors)) / 1000)
+    bone[box] &= ~agent_in_bone(bone[box], dense.urine)
     place = Place(to_index, np.asarray(organ.center_mass), dense.is_enhanced)
     codes = np.zeros(own.shape, np.uint8)
     inside = np.zeros(own.shape, bool)
@@ -188,7 +194,7 @@ def of_tissues(codes: np.ndarray, *tissues: str) -> np.ndarray:
 def _median(hu: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
     """Return the median of each voxel and its neighbours: noise goes, edges stay. Thick slices are not mixed."""
     radius = [0 if mm > 2 * spacing_mm.min() else 1 for mm in spacing_mm]
-    image = sitk.GetImageFromArray(np.ascontiguousarray(hu, np.float32))
+    image = sitk.GetImageFromArray(np.rint(hu).astype(np.int16, order="C"))
     return sitk.GetArrayFromImage(sitk.Median(image, radius[::-1]))
 
 
