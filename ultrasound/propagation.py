@@ -38,6 +38,8 @@ THICK_PLANE = ((0.0, 2 / 3), (-(1.5**0.5), 1 / 6), (1.5**0.5, 1 / 6))
 # The renal capsule's echo where the beam meets it squarely, the angle [rad] by which it falls to exp(-1/2), and the share of a mirror. An estimate:
 # sonographers expect a thin bright line, which fades where the beam is more than 20 degrees off.
 CAPSULE, CAPSULE_TILT, CAPSULE_MIRROR = 0.1, float(np.radians(10)), 0.85
+# Of distances from the organ's surface, between the points at which they are known (``distance_volume``).
+DISTANCE_ERROR_MM = 2.0
 # What has less impedance is gas: in an empty crater no fluid stays.
 LEAST_FLUID_MRAYL = 0.3
 
@@ -180,19 +182,23 @@ class Propagation:
     @ti.func
     def sample_scanline(self, thick: ti.template(), line, count, step_mm):
         """Sample a scanline at even steps of time, which are as long as sound is fast in the tissue."""
-        depth, in_front, before, parenchyma_before = 0.0, True, 0.0, False
+        depth, in_front, parenchyma_before = 0.0, True, False
+        # No surface of the organ is so near.
+        clear_mm = 0.0
         for k in range(count):
             planes = ti.static(THICK_PLANE if thick else CENTRAL_PLANE)
             found = self.tissue_at(planes, self.start[line] + depth * self.direction[line], self.slice_sd[k])
             self.capsule[line, k] = tm.vec4(0.0)
             is_parenchyma = found.tissue.w > 0.5
             if k > 0 and (is_parenchyma or parenchyma_before):
-                distance = self.organ.sample(found.rest)
-                if not parenchyma_before:
-                    before = self.organ.sample(self.rest[line, k - 1])
-                if distance * before < 0.0:
-                    self.add_capsule(line, k, found, before / (before - distance), step_mm)
-                before = distance
+                clear_mm -= (found.rest - self.rest[line, k - 1]).norm()
+                if clear_mm <= 0.0:
+                    before, after = self.organ.sample(self.rest[line, k - 1]), self.organ.sample(found.rest)
+                    if before * after < 0.0:
+                        self.add_capsule(line, k, found, before / (before - after), step_mm)
+                    clear_mm = ti.abs(after) - DISTANCE_ERROR_MM
+            else:
+                clear_mm = 0.0
             parenchyma_before = is_parenchyma
             if ti.static(self.has_fluid):
                 if in_front:
