@@ -180,7 +180,7 @@ class Scanner:
         return volume
 
     def _propagation(self) -> Propagation:
-        voxel_mm = float(self.anatomy.voxels.spacing_mm.mean())
+        voxel_mm = float(self.anatomy.voxels.spacing_mm.max())
         around = self.contact, self.contact_gap_mm, self.around, self.has_fluid
         return Propagation(self.tissue, self.organ, self.plane, self.probe, voxel_mm, *around)
 
