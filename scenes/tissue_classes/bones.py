@@ -28,6 +28,14 @@ def bones(hu: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
     return fine[: hu.shape[0], : hu.shape[1], : hu.shape[2]]
 
 
+def spine_middle(bone: np.ndarray) -> np.ndarray | None:
+    """Return the index (3,), fractional, of the middle of the spine, the largest bone (nx, ny, nz); None without a bone."""
+    parts, count = ndimage.label(bone)
+    if count == 0:
+        return None
+    return np.argwhere(parts == 1 + np.argmax(np.bincount(parts.ravel())[1:])).mean(axis=0)
+
+
 def _filled(solid: np.ndarray, axis: int) -> np.ndarray:
     """Fill the holes of each section across an axis."""
     beside = ndimage.generate_binary_structure(3, 1)

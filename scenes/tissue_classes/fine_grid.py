@@ -81,6 +81,12 @@ def coarse_distance(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
     return distance[tuple(slice(n) for n in mask.shape)]
 
 
+def repeated(coarse: np.ndarray, step: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the values of cells of so many voxels (3,) at the voxels of a grid."""
+    fine = coarse.repeat(step[0], 0).repeat(step[1], 1).repeat(step[2], 2)
+    return fine[: shape[0], : shape[1], : shape[2]]
+
+
 def box_around(mask: np.ndarray, voxels: int) -> Box:
     """Return the box around a mask that is not empty, some voxels wider, within its grid."""
     found = ndimage.find_objects(mask.astype(np.uint8))[0]

@@ -8,15 +8,19 @@ from skimage.feature import peak_local_max
 from skimage.measure import block_reduce
 from skimage.segmentation import watershed
 
+from scenes.tissue_classes.bones import spine_middle
+from scenes.tissue_classes.fine_grid import repeated
+from scenes.tissue_classes.vessels import blood
+
 GAS_BELOW_HU, FAT_BELOW_HU, METAL_ABOVE_HU = -300.0, -30.0, 2500.0
-# With contrast agent, blood is brighter than this, and contrast agent in the ureter and bowel than the second value.
-BLOOD_ABOVE_HU, DENSE_ABOVE_HU = 140.0, 260.0
 # Marrow where its shell is not closed: share of its surface that is bone; without contrast agent, by its HU and volume.
-MARROW_SURFACE, MARROW_ABOVE_HU, LEAST_MARROW_ML = 0.4, 120.0, 0.4
-# Contrast agent in the bowel: so far in front of the spine's middle, and with this share of its volume deeper than a bone's shell.
-BEFORE_SPINE_MM, SHELL_MM, SOLID_SHARE = 15.0, 2.5, 0.1
-# Of an enhanced CT, muscle is darker than this, liver and spleen are brighter. Fluid in the bowel is darker than the third value.
-LIVER_ABOVE_HU, FLUID_BELOW_HU = 88.0, 32.0
+MARROW_SURFACE, ENHANCED_MARROW_ABOVE_HU, MARROW_ABOVE_HU, LEAST_MARROW_ML = 0.4, 140.0, 120.0, 0.4
+# Contrast agent in the bowel: so bright, so far in front of the spine's middle, and with this share of its volume deeper than a bone's shell.
+DENSE_ABOVE_HU, BEFORE_SPINE_MM, SHELL_MM, SOLID_SHARE = 260.0, 15.0, 2.5, 0.1
+# Of an enhanced CT, muscle is darker than this, liver and spleen are brighter.
+LIVER_ABOVE_HU = 88.0
+# Bile, and fluid in the bowel: with contrast agent, and without; in bodies with so many cells to each side of their middle.
+ENHANCED_FLUID_HU, FLUID_HU, FLUID_CELLS = (-10.0, 32.0), (-10.0, 12.0), 2
 # Large bodies of soft tissue are searched in cells of this size; they contain a ball of the first radius, liver and spleen of the second.
 CELL_MM, BODY_MM, ORGAN_MM = 3.0, 7.0, 12.0
 BODIES = ("muscle", "liver", "spleen")
@@ -64,7 +68,8 @@ def surroundings(
     masks |= _bodies(hu, soft, bone, place)
     masks["bowel"] = soft & _near(gas & ~_open_air(gas), BOWEL_WALL_MM, place) & ~masks["muscle"]
     if place.is_enhanced:
-        vessel = soft & (hu > BLOOD_ABOVE_HU) & (hu < DENSE_ABOVE_HU)
+        # Beside bone and kidney, the mean is theirs.
+        vessel = soft & blood(hu, masks["liver"] | masks["spleen"], place.spacing_mm) & ~_dilated(bone, 2)
         vessel[near] &= ~beside
         masks["vessel"] = vessel
     masks["bowel"] = masks["bowel"] | agent
@@ -99,7 +104,7 @@ def _cell_voxels(place: Place) -> np.ndarray:
 
 def _marrow(hu: np.ndarray, bone: np.ndarray, kidney: np.ndarray, place: Place) -> np.ndarray:
     """Return bright pieces whose surface is bone for the most part; without contrast agent, all large bright pieces."""
-    bright = (hu > (BLOOD_ABOVE_HU if place.is_enhanced else MARROW_ABOVE_HU)) & ~kidney & ~bone
+    bright = (hu > (ENHANCED_MARROW_ABOVE_HU if place.is_enhanced else MARROW_ABOVE_HU)) & ~kidney & ~bone
     pieces, count = ndimage.label(bright)
     sizes = np.bincount(pieces.ravel(), minlength=count + 1)
     if place.is_enhanced:
@@ -136,16 +141,11 @@ def _near(mask: np.ndarray, distance_mm: float, place: Place) -> np.ndarray:
     step = _cell_voxels(place)
     coarse = block_reduce(mask, tuple(step), np.max)
     near = ndimage.distance_transform_edt(~coarse, sampling=place.spacing_mm * step) <= distance_mm
-    return _repeated(near, step, mask.shape)
-
-
-def _repeated(coarse: np.ndarray, step: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    fine = coarse.repeat(step[0], 0).repeat(step[1], 1).repeat(step[2], 2)
-    return fine[: shape[0], : shape[1], : shape[2]]
+    return repeated(near, step, mask.shape)
 
 
 def _bodies(hu: np.ndarray, soft: np.ndarray, bone: np.ndarray, place: Place) -> dict[str, np.ndarray]:
-    """Return liver, spleen and muscle: soft tissue in large bodies."""
+    """Return liver, spleen and muscle, soft tissue in large bodies; and fluid."""
     step = _cell_voxels(place)
     cell_mm = place.spacing_mm * step
     mean, inside = block_reduce(hu, tuple(step), np.mean), block_reduce(soft, tuple(step), np.mean) >= 0.5
@@ -169,17 +169,24 @@ def _bodies(hu: np.ndarray, soft: np.ndarray, bone: np.ndarray, place: Place) ->
             ndimage.distance_transform_edt(~core, sampling=cell_mm) > BODY_MM + CELL_MM
         )
         found[beside] = BODIES.index("muscle") + 1
-    codes = _repeated(found.astype(np.uint8), step, soft.shape)
-    return {name: soft & (codes == code) for code, name in enumerate(BODIES, 1)}
+    codes = repeated(found.astype(np.uint8), step, soft.shape)
+    low, high = _fluid_hu(place.is_enhanced)
+    # The opening leaves nothing of layers that soft tissue and fat have in common.
+    fluid = inside & (found != BODIES.index("muscle") + 1) & (mean > low) & (mean < high)
+    fluid = ndimage.binary_opening(fluid, iterations=FLUID_CELLS)
+    near_fluid = repeated(ndimage.binary_dilation(fluid), step, soft.shape)
+    masks = {name: soft & (codes == code) for code, name in enumerate(BODIES, 1)}
+    return masks | {"fluid": soft & near_fluid & (hu > low) & (hu < high)}
+
+
+def _fluid_hu(is_enhanced: bool) -> tuple[float, float]:
+    return ENHANCED_FLUID_HU if is_enhanced else FLUID_HU
 
 
 def _spine(bone: np.ndarray, step: np.ndarray, place: Place) -> np.ndarray | None:
-    """Return the middle (3,) of the largest bone, from the kidney's [mm]; None without one."""
-    parts, count = ndimage.label(bone)
-    if count == 0:
-        return None
-    largest = parts == 1 + np.argmax(np.bincount(parts.ravel())[1:])
-    return place.of_indices(_middle(largest, step))[0]
+    """Return the middle (3,) of the spine, from the kidney's [mm], by a mask of cells; None without a bone."""
+    middle = spine_middle(bone)
+    return None if middle is None else place.of_indices((middle[None] + 0.5) * step - 0.5)[0]
 
 
 def _middle(cells: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -191,7 +198,7 @@ def _body(
     level_hu: float, radius_mm: float, at: np.ndarray, spine: np.ndarray | None, is_enhanced: bool
 ) -> str:
     """Return the tissue of a body of soft tissue by its HU, the ball in it, and its place from the kidney [mm]."""
-    if level_hu < FLUID_BELOW_HU - (0 if is_enhanced else 20):
+    if level_hu < _fluid_hu(is_enhanced)[1]:
         return "soft-tissue"
     beside_spine = spine is not None and abs(at[0] - spine[0]) < BESIDE_SPINE_MM and at[1] > spine[1] - 25.0
     is_muscle = level_hu < LIVER_ABOVE_HU if is_enhanced else at[1] > BEHIND_MM or beside_spine

@@ -11,7 +11,7 @@ import SimpleITK as sitk
 import trimesh
 from scipy import ndimage
 
-from scenes.tissue_classes.bones import bones
+from scenes.tissue_classes.bones import bones, spine_middle
 from scenes.tissue_classes.collecting_system import (
     DensePieces,
     agent_in_bone,
@@ -34,6 +34,7 @@ from scenes.tissue_classes.fine_grid import (
 from scenes.tissue_classes.kidney_parts import kidney_parts
 from scenes.tissue_classes.lesion_parts import lesion_parts
 from scenes.tissue_classes.surroundings import METAL_ABOVE_HU, Place, surroundings
+from scenes.tissue_classes.vessels import arterial_aorta, with_branches
 
 # In the order of their codes.
 TISSUES = (
@@ -134,9 +135,10 @@ def tissue_map(
     sharp, smooth = refined(hu, factors), refined(_median(hu, spacing), factors)
     to_index = fine_index_from_mm(index_from_mm, factors)
     shape = KidneyShape.of(organ, to_index, own.shape)
-    bone = refined(bones(hu, spacing) & (labels == 0), factors) > 0.5
+    both = _bones_and_arteries(hu, labels, index_from_mm)
+    bone, artery = (refined(mask & (labels == 0), factors) > 0.5 for mask in both)
     box = shape.box
-    dense = _dense(sharp[box], own[box], shape, float(np.prod(spacing / factors)) / 1000)
+    dense = _dense(sharp[box], own[box], artery[box], shape, float(np.prod(spacing / factors)) / 1000)
     bone[box] &= ~agent_in_bone(bone[box], dense.urine)
     place = Place(to_index, np.asarray(organ.center_mass), dense.is_enhanced)
     codes = np.zeros(own.shape, np.uint8)
@@ -144,7 +146,7 @@ def tissue_map(
     inside[box] = shape.inside
     _write(codes, surroundings(smooth, inside, bone & ~inside, box, place))
     # A clip is thinner than what a median leaves.
-    _write(codes, {"metal": (sharp > METAL_ABOVE_HU) & ~inside})
+    _write(codes, {"vessel": artery & ~inside, "metal": (sharp > METAL_ABOVE_HU) & ~inside})
     drawn = np.zeros(own.shape, bool)
     kidney = shape.inside & np.isin(own[box], [0, CODE["kidney"]])
     _write(codes[box], kidney_parts(smooth[box], kidney, shape.hollow, -shape.outer_mm))
@@ -171,7 +173,11 @@ def dense_pieces_of_kidney(
     to_index = fine_index_from_mm(index_from_mm, factors)
     shape = KidneyShape.of(organ, to_index, own.shape)
     box = shape.box
-    found = _dense(refined(hu, factors)[box], own[box], shape, float(np.prod(spacing / factors)) / 1000)
+    _, artery = _bones_and_arteries(hu, labels, index_from_mm)
+    artery = refined(artery, factors) > 0.5
+    found = _dense(
+        refined(hu, factors)[box], own[box], artery[box], shape, float(np.prod(spacing / factors)) / 1000
+    )
     # Stones, and other labels than the whole kidney's, are written over contrast agent.
     shown = replace(found, urine=found.urine & ~found.stone & np.isin(own[box], [0, CODE["kidney"]]))
     to_index[:3, 3] -= [a.start for a in box]
@@ -206,9 +212,28 @@ def _outer_distance(distance_mm: np.ndarray) -> np.ndarray:
     return np.minimum(distance_mm, np.where(near, CONCAVITY_MM - inside, FAR_MM)).astype(np.float32)
 
 
-def _dense(hu: np.ndarray, own: np.ndarray, shape: KidneyShape, voxel_ml: float) -> DensePieces:
-    """Return the dense pieces in what is not labelled, or labelled as parenchyma or sinus."""
-    unlabelled = (own == 0) | of_tissues(own, *PARENCHYMA, "sinus")
+def _bones_and_arteries(
+    hu: np.ndarray, labels: np.ndarray, index_from_mm: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return masks of bones, and of the aorta with its branches where these are as bright: in the arterial phase."""
+    mm_from_index = np.linalg.inv(index_from_mm)
+    spacing = np.linalg.norm(mm_from_index[:3, :3], axis=0)
+    bone = bones(hu, spacing)
+    spine = spine_middle(bone)
+    if spine is None:
+        return bone, np.zeros(hu.shape, bool)
+    aorta = arterial_aorta(hu, mm_from_index, mm_from_index[:3, :3] @ spine + mm_from_index[:3, 3])
+    if not aorta.any():
+        return bone, aorta
+    bone = bones(np.where(aorta, 0, hu), spacing)
+    return bone, with_branches(hu, aorta, bone | (labels > 0))
+
+
+def _dense(
+    hu: np.ndarray, own: np.ndarray, artery: np.ndarray, shape: KidneyShape, voxel_ml: float
+) -> DensePieces:
+    """Return the dense pieces in what is not labelled, or labelled as parenchyma or sinus, and no artery."""
+    unlabelled = ((own == 0) & ~artery) | of_tissues(own, *PARENCHYMA, "sinus")
     parenchyma = shape.inside & ((own == 0) | of_tissues(own, *PARENCHYMA))
     hidden = np.where(unlabelled, hu, -FAR_MM)
     # Beside labelled contrast agent, voxels are as bright by partial volume.

@@ -20,7 +20,7 @@ PLAIN = {
     "vessel": 42,
 }
 ENHANCED = PLAIN | {"muscle": 65, "liver": 115, "spleen": 125, "kidney": 185, "vessel": 180}
-BONE, MARROW, BOWEL = 600, 170, 40
+BONE, MARROW, BOWEL, BILE = 600, 170, 40, 5
 LEFT, RIGHT = np.array([68.0, 26.0, 0.0]), np.array([-68.0, 26.0, -6.0])
 HALF_AXES = np.array([25.0, 20.0, 46.0])
 LOW, HIGH = np.array([-174.0, -117.0, -72.0]), np.array([174.0, 117.0, 72.0])
@@ -59,6 +59,7 @@ def structures(at: np.ndarray) -> np.ndarray:
         ("marrow", _column(at, 0, 50, 18)),
         ("vessel", _column(at, 12, 16, 10) | _column(at, -15, 17, 11)),
         ("liver", _ellipsoid(at, (-74, -32, 10), (52, 40, 60))),
+        ("bile", _ellipsoid(at, (-52, -44, 0), (15, 15, 22))),
         ("spleen", _ellipsoid(at, (108, -12, 15), (17, 30, 42))),
         ("bowel", _ellipsoid(at, (35, -48, -10), (24, 22, 40))),
         ("gas", _ellipsoid(at, (35, -52, -10), (15, 12, 32))),
@@ -75,13 +76,21 @@ def abdomen(
     spacing=(3.0, 3.0, 4.0),
     axes=(0, 1, 2),
     mirrored=(False, False, False),
+    others=(),
 ) -> Abdomen:
-    """The abdomen, of which a kidney is labelled, in voxels of a spacing along x, y and z, stored with its axes in an order and mirrored."""
+    """The abdomen, of which a kidney is labelled, in voxels of a spacing along x, y and z, stored with its axes in an order and mirrored.
+
+    ``others`` are pairs of a structure and its HU, where these are not the usual ones.
+    """
     spacing = np.array(spacing)
     count = np.ceil((HIGH - LOW) / spacing).astype(int)
     at = LOW + np.moveaxis(np.indices(count), 0, -1) * spacing
     truth = structures(at)
-    table = (ENHANCED if enhanced else PLAIN) | {"bone": BONE, "marrow": MARROW, "bowel": BOWEL}
+    table = (
+        (ENHANCED if enhanced else PLAIN)
+        | {"bone": BONE, "marrow": MARROW, "bowel": BOWEL, "bile": BILE}
+        | dict(others)
+    )
     hu = np.zeros(truth.shape, np.float32)
     for name, value in table.items():
         hu[truth == name] = value

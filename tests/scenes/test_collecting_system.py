@@ -13,6 +13,7 @@ from scenes.tissue_classes.collecting_system import (
     PELVIS_MM,
     SMALL_ML,
     DensePieces,
+    agent_in_bone,
     dense_pieces,
     pelvis_without_agent,
 )
@@ -150,3 +151,11 @@ def test_without_parenchyma_nothing_breaks():
         kidney_of(PLAIN, box((1, 2), (1, 2), (1, 2)), 0.0), np.zeros(SHAPE, bool), np.zeros(SHAPE, bool)
     )
     assert not (found.urine.any() or found.stone.any() or found.is_enhanced)
+
+
+def test_a_piece_of_bone_that_contains_contrast_agent_is_none_but_a_bone_beside_it_stays():
+    spine, rest = box((0, 20), (0, 20), (0, 20)), box((30, 36), (5, 11), (5, 11))
+    # The agent reaches into a corner of the spine, as where small gaps between both were closed.
+    urine = box((31, 35), (6, 10), (6, 10)) | box((18, 22), (18, 22), (18, 22))
+    found = agent_in_bone(spine | rest, urine)
+    assert (found == rest).all()

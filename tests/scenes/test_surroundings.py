@@ -86,6 +86,56 @@ def test_blood_is_known_by_contrast_agent_alone(side, enhanced):
         assert not found.mask("vessel").any()
 
 
+AS_STORED = (3.0, 3.0, 4.0), (0, 1, 2), (False, False, False)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_blood_hardly_brighter_than_the_liver_is_known_in_wide_vessels(side):
+    # The median of the liver is 115 HU, so that noise of 8 HU reaches what blood has.
+    body, found = made(side, True, *AS_STORED, (("vessel", 138),))
+    assert recall(body, found, "vessel", "vessel") > 0.6
+    for organ in ("liver", "spleen", "muscle"):
+        assert recall(body, found, organ, "vessel") < 0.01, organ
+
+
+@pytest.mark.parametrize("hu", [300, 450])
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_vessels_as_bright_as_bone_in_the_arterial_phase_are_no_bone_and_no_bowel(side, hu):
+    body, found = made(side, True, *AS_STORED, (("vessel", hu),))
+    assert recall(body, found, "vessel", "vessel") > 0.95
+    assert recall(body, found, "bone", "bone") > 0.95 and recall(body, found, "marrow", "bone") > 0.95
+    assert max(recall(body, found, "bone", "vessel"), recall(body, found, "fat", "bone")) < 0.005
+
+
+def test_marrow_as_bright_as_arteries_is_bone():
+    body, found = made("left", True, *AS_STORED, (("marrow", 320),))
+    assert recall(body, found, "marrow", "bone") > 0.95
+
+
+def test_contrast_agent_in_the_bowel_away_from_the_spine_is_no_artery():
+    # As long as the CT, as a descending colon is.
+    body = abdomen("left", True)
+    index = np.moveaxis(np.indices(body.truth.shape), 0, -1)
+    at = (index - body.index_from_mm[:3, 3]) @ np.linalg.inv(body.index_from_mm[:3, :3]).T
+    colon = np.hypot(at[..., 0] - 70, at[..., 1] + 40) < 12
+    hu = np.where(colon, 400, body.hu)
+    found = tissue_map(hu, body.labels, body.organ, body.index_from_mm)
+    factors = np.array(found.codes.shape) // colon.shape
+    for axis, factor in enumerate(factors):
+        colon = colon.repeat(factor, axis)
+    # Its rim has the HU of blood by partial volume.
+    assert found.mask("bowel")[colon].mean() > 0.8 and found.mask("vessel")[colon].mean() < 0.1
+
+
+@pytest.mark.parametrize("enhanced", [True, False])
+def test_the_gallbladder_is_fluid(enhanced):
+    body, found = made("right", enhanced)
+    # Its radius is 15 mm, of which the partial volume of its border takes a voxel of 3 mm.
+    assert recall(body, found, "bile", "fluid") > 0.5
+    for structure in ("liver", "muscle", "fat", "vessel"):
+        assert recall(body, found, structure, "fluid") < 0.01, structure
+
+
 @pytest.mark.parametrize("side, enhanced", SIDES)
 def test_parenchyma_is_within_the_surface_and_nothing_of_the_surroundings_in_it(side, enhanced):
     body, found = made(side, enhanced)
