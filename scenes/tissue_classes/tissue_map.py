@@ -159,6 +159,7 @@ def tissue_map(
         drawn |= layers
     _write_labels(codes, own, sharp, place.spacing_mm)
     _write(codes[box], {"stone": dense.stone})
+    drawn[box] &= ~dense.stone
     drawn &= (own == 0) | (own == CODE["kidney"])
     return TissueMap(codes, np.rint(sharp).astype(np.int16), drawn, to_index)
 

@@ -9,6 +9,8 @@ from tqdm import tqdm
 
 from rehearsal.commands.command_line import CommandError, load_patient, make_folder, start_taichi
 from rehearsal.result_files import rounded
+from scenes.anatomy import LoadedAnatomy
+from scenes.scene import Scene
 from studies.patient_images.image_sheet import write_sheet
 from studies.patient_images.patient_image_scans import ImagedPatient
 from studies.patient_images.picture_figures import picture_figures
@@ -87,11 +89,13 @@ def patient_images(patients: tuple[Path, ...], names: tuple[str, ...], out: Path
     """
     make_folder(out)
     probes = {Path(name).stem: load_probe(name) for name in names}
+    # All before the first is imaged: a wrong path is refused before any work.
+    loaded = [_loaded(path) for path in patients]
     backend = start_taichi("cpu")
     rows: list[PatientImageRow] = []
     with tqdm(total=len(patients) * len(probes), desc="patient-images", unit="sheet") as bar:
-        for number, path in enumerate(patients, 1):
-            patient = _imaged_patient(path)
+        for number, (scene, anatomy) in enumerate(loaded, 1):
+            patient = ImagedPatient.of(scene, anatomy)
             for name, probe in probes.items():
                 rows.append(_row(patient, number, name, probe, out))
                 bar.update()
@@ -106,11 +110,12 @@ def patient_images(patients: tuple[Path, ...], names: tuple[str, ...], out: Path
     write_results(out, "patient-images", report, text, described)
 
 
-def _imaged_patient(path: Path) -> ImagedPatient:
+def _loaded(path: Path) -> tuple[Scene, LoadedAnatomy]:
+    """Return a patient with CT and labels. Raises CommandError, SceneError, PatientError."""
     scene, anatomy = load_patient(path)
     if anatomy.ct is None or anatomy.labels is None:
         raise CommandError(f"{path}: has no CT or no labels; expected both (anatomy.ct, anatomy.labels)")
-    return ImagedPatient.of(scene, anatomy)
+    return scene, anatomy
 
 
 def _row(patient: ImagedPatient, number: int, name: str, probe: Probe, out: Path) -> PatientImageRow:

@@ -165,6 +165,13 @@ def test_small_stones_remain():
     assert found_in(scene(PLAIN, stone=(stone, 700))).mask("stone")[stone].all()
 
 
+def test_stones_are_not_drawn_though_the_parenchyma_about_them_is():
+    stone = ball(-14.0, 0.0, 10.0, 2.5) & KIDNEY
+    found = found_in(scene(PLAIN, stone=(stone, 700)), draws=True)
+    assert found.mask("stone")[stone].all() and not (found.drawn & found.mask("stone")).any()
+    assert found.drawn[KIDNEY].any()
+
+
 def test_contrast_agent_in_labelled_urine_and_about_it_is_no_stone():
     urine, agent = ball(6.0, 0.0, 0.0, 4.0), ball(6.0, 0.0, 0.0, 4.6)
     found = found_in(scene(ENHANCED, agent=(agent, 500)), labelled(urine=urine))

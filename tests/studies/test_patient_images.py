@@ -394,6 +394,13 @@ class TestMadePatient:
         assert app.main(arguments) != 0
         assert "has no CT or no labels" in capsys.readouterr().err
 
+    def test_a_wrong_patient_is_refused_before_any_work(self, tmp_path, capsys):
+        out = tmp_path / "out"
+        write_patient(made_patient(), tmp_path)
+        arguments = ["study", "patient-images", str(tmp_path), str(tmp_path / "nobody"), "--out", str(out)]
+        assert app.main(arguments) != 0
+        assert "nobody: no such scene" in capsys.readouterr().err and not out.exists()
+
 
 def test_every_tissue_has_a_colour():
     assert set(tissue_table()) - {"hounsfield"} <= set(COLOURS)
