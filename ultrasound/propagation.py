@@ -61,7 +61,7 @@ class Propagation:
     from the organ's surface [mm], both at rest; ``plane`` is a ``PlaneInTissue``. An element transmits and receives
     only in contact: with the organ, nearer than ``contact_gap_mm``, or, where ``contact`` is "tissue", with anything but gas.
     ``around`` is the impedance [MRayl] of all that is outside the organ; None for what the CT shows there. With ``has_fluid``, what a
-    scanline passes before it enters the organ is irrigation fluid where it is nearer than ``contact_gap_mm``, but no gas.
+    scanline passes from the array to the organ, nearer than ``contact_gap_mm`` all the way, is irrigation fluid, but no gas.
 
     ``tissue`` and ``rest`` (scanlines, samples) are what is there; ``across`` is the rest direction across the image plane. ``depth`` is
     where a sample is [mm]; the scanner shows it where it would be if sound were as fast everywhere (SOUND_MM_US).
@@ -203,8 +203,9 @@ class Propagation:
             if ti.static(self.has_fluid):
                 if in_front:
                     distance = self.organ.sample(found.rest)
-                    in_front = distance > 0.0
-                    if in_front and distance <= self.gap_mm and found.tissue.x > LEAST_FLUID_MRAYL:
+                    # Where a scanline passes the organ at a distance, what is behind is the organ's surroundings, no fluid on it.
+                    in_front = distance > 0.0 and distance <= self.gap_mm
+                    if in_front and found.tissue.x > LEAST_FLUID_MRAYL:
                         found.tissue = tm.vec4(self.fluid)
             self.tissue[line, k] = found.tissue.xyz
             if found.tissue.w > 0.0:

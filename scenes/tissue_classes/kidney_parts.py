@@ -12,8 +12,8 @@ CORTEX_ABOVE_MEDULLA_HU, OUTER_MM, INNER_MM, LEAST_VOXELS = 40.0, (2.0, 5.0), (9
 RIM_MM = 5.0
 FAT_BELOW_HU = -20.0
 # In the hollow of a kidney, what is nearly as bright as parenchyma is a vessel or the pelvis: without contrast agent, so much darker at most,
-# as fat in the same voxels makes more of a difference; with it, so much of its HU at least.
-VESSEL_BELOW_MEDIAN_HU, ENHANCED_VESSEL_SHARE = 10.0, 0.6
+# as fat in the same voxels makes more of a difference, and so much brighter, as a stone's blur is more; with it, this share of its HU at least.
+VESSEL_AGAINST_MEDIAN_HU, ENHANCED_VESSEL_SHARE = (-10.0, 30.0), 0.6
 # In a kidney with contrast agent, what has less than this share of the parenchyma's HU, or of its medulla's, is sinus or a calyx without.
 SINUS_SHARE = 0.5
 # Parenchyma is brighter than this, with or without contrast agent; urine without is darker.
@@ -39,9 +39,8 @@ def kidney_parts(
     median = median_hu(hu, parenchyma)
     is_enhanced = median > ENHANCED_FROM_HU
     deep = parenchyma & (depth_mm > RIM_MM)
-    vessel = hollow & (
-        hu > (ENHANCED_VESSEL_SHARE * median if is_enhanced else median - VESSEL_BELOW_MEDIAN_HU)
-    )
+    low, high = (median + off for off in VESSEL_AGAINST_MEDIAN_HU)
+    vessel = hollow & ((hu > ENHANCED_VESSEL_SHARE * median) if is_enhanced else (hu > low) & (hu < high))
     levels = cortex_and_medulla_hu(hu, parenchyma, depth_mm) if is_enhanced else None
     darkest = median if levels is None else levels[1]
     sinus = (hollow & ~vessel) | (deep & (hu < (SINUS_SHARE * darkest if is_enhanced else FAT_BELOW_HU)))

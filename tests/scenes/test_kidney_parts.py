@@ -9,7 +9,7 @@ from scenes.tissue_classes.kidney_parts import (
     ENHANCED_VESSEL_SHARE,
     FAT_BELOW_HU,
     SINUS_SHARE,
-    VESSEL_BELOW_MEDIAN_HU,
+    VESSEL_AGAINST_MEDIAN_HU,
     cortex_and_medulla_hu,
     kidney_parts,
 )
@@ -140,7 +140,7 @@ def test_what_takes_up_no_contrast_agent_deep_in_a_kidney_is_no_parenchyma(off, 
 
 
 @pytest.mark.parametrize(
-    "level, border", [(35.0, 35.0 - VESSEL_BELOW_MEDIAN_HU), (180.0, ENHANCED_VESSEL_SHARE * 180.0)]
+    "level, border", [(35.0, 35.0 + VESSEL_AGAINST_MEDIAN_HU[0]), (180.0, ENHANCED_VESSEL_SHARE * 180.0)]
 )
 def test_in_the_hollow_what_is_as_bright_as_blood_is_a_vessel(level, border):
     vessel = HOLLOW & (np.hypot(AT[..., 0], AT[..., 1]) < 3.0)
@@ -150,6 +150,14 @@ def test_in_the_hollow_what_is_as_bright_as_blood_is_a_vessel(level, border):
     assert (parts["vessel"] == vessel).all() and (parts["sinus"] == (HOLLOW & ~vessel)).all()
     hu[vessel] = border - 1
     assert not parts_of(hu)["vessel"].any()
+
+
+def test_without_contrast_agent_what_is_brighter_than_blood_in_the_hollow_is_no_vessel():
+    blur = HOLLOW & (np.hypot(AT[..., 0], AT[..., 1]) < 3.0)
+    for off, is_vessel in ((-1, True), (1, False)):
+        hu = np.where(PARENCHYMA, 35.0, FAT_HU)
+        hu[blur] = 35.0 + VESSEL_AGAINST_MEDIAN_HU[1] + off
+        assert parts_of(hu)["vessel"].any() == is_vessel
 
 
 @pytest.mark.parametrize("medulla_hu", [90.0, 180.0])

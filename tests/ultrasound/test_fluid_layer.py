@@ -152,19 +152,18 @@ def test_inside_the_gap_it_is_as_gel_of_the_same_values(taichi):
     assert np.array_equal(*images) and np.ptp(images[0]) > 20
 
 
-def test_behind_the_organ_and_beyond_the_layer_is_what_the_ct_shows(taichi):
+@pytest.mark.parametrize(("gap", "has_layer"), [(3.0, True), (8.0, False)])
+def test_behind_the_organ_and_without_coupling_is_what_the_ct_shows(taichi, gap, has_layer):
     tank = wet(flat_tank(0.5), lambda x, y: np.abs(y - THICKNESS_MM / 2) - THICKNESS_MM / 2)
     tank.fill(impedance=FAT, attenuation=0.6)
-    probe = probe_of()
     sound = tank.bmode.sound
-    for gap in (3.0, 8.0):
-        tank.look(probe, at=(0, -gap, 0))
-        y = array_of(sound.rest)[..., 1][96, : int(30 / 0.5)]
-        impedance = array_of(sound.tissue)[96, : len(y), 0]
-        is_fluid = (y > -GAP_MM + 0.1) & (y < -0.1)
-        np.testing.assert_allclose(impedance[is_fluid], WATER[0], rtol=1e-6)
-        np.testing.assert_allclose(impedance[(y > 0.1) | (y < -GAP_MM - 0.1)], FAT, rtol=1e-6)
-        assert is_fluid.sum() > 2 and (y > THICKNESS_MM + 0.5).any()
+    tank.look(probe_of(), at=(0, -gap, 0))
+    y = array_of(sound.rest)[..., 1][96, : int(30 / 0.5)]
+    impedance = array_of(sound.tissue)[96, : len(y), 0]
+    layer = (y > -GAP_MM + 0.1) & (y < -0.1)
+    np.testing.assert_allclose(impedance[layer], WATER[0] if has_layer else FAT, rtol=1e-6)
+    np.testing.assert_allclose(impedance[(y > 0.1) | (y < -GAP_MM - 0.1)], FAT, rtol=1e-6)
+    assert layer.sum() > 2 and (y > THICKNESS_MM + 0.5).any()
 
 
 def test_gas_in_the_layer_stays_gas(half_space):
@@ -188,3 +187,11 @@ def test_no_blood_flows_in_it(half_space):
     doppler.estimate(probe, 0.0)
     y, energy = array_of(sound.rest)[96, :60, 1], array_of(doppler.moment)[96, :60, 2]
     assert energy[y < -0.5].max() < 1e-9 * energy[y > 0.5].max()
+
+
+def test_beside_a_surface_that_a_scanline_passes_in_the_depth_there_is_no_fluid(taichi):
+    """As in the hilum: nearer to the organ than the layer is thick around a depth of 20 mm alone, and nowhere inside."""
+    tank = wet(flat_tank(0.5), lambda x, y: 0.5 * GAP_MM + np.abs(y - 20.0))
+    tank.fill(impedance=FAT, attenuation=0.6)
+    tank.look(probe_of(), at=(0, -1.0, 0))
+    np.testing.assert_allclose(array_of(tank.bmode.sound.tissue)[96, :60, 0], FAT, rtol=1e-6)
