@@ -16,10 +16,10 @@ LEAST_MM, MOST_MM = 12, 60
 NEAR_MM = 30.0
 # Thickness of each of the layers within and beyond the outline that are compared: two of the squares that speckle is averaged over.
 LAYER_MM = 6
-# A border has this contrast, 1.2 dB of grey values: a step costs 1 without contrast, 1/e with it. Where the image does not reach,
-# there may be a border or not.
+# At a border grey values rise by this ratio: a step costs 1/e there, 1 where they do not rise. Where the image does not reach, it is not known
+# whether there is a border.
 CONTRAST, UNKNOWN_COST = 1.15, 0.5
-# Neighbouring directions, 2 degrees apart, are averaged with this SD: 2 mm of outline at 30 mm.
+# Neighbouring directions, 2 degrees apart, are averaged with this SD, in directions: 2 mm of outline at 30 mm.
 ANGLES, ANGLES_SD = 180, 2.0
 # The sinus is in the outline of a kidney: hollows that no disc of this radius enters.
 SINUS_MM = 10.0
@@ -42,6 +42,7 @@ def outlined_kidney(
     away, angle = np.hypot(down, right), np.arctan2(down, right)
     parenchyma = max(float(np.median(image[covered & (away <= NEAR_MM)])), 1.0)
     level = np.log(np.maximum(image, parenchyma))
+    # A step of the radius is 1 mm.
     radius = np.arange(MOST_MM + LAYER_MM)
     directions = np.sin(_angles())[:, None], np.cos(_angles())[:, None]
     places = [at + radius * to / mm for at, to, mm in zip(centre, directions, pixel_mm, strict=True)]
