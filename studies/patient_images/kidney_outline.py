@@ -24,6 +24,8 @@ ANGLES, ANGLES_SD = 180, 2.0
 # The sinus is in the outline of a kidney: hollows that no disc of this radius enters.
 SINUS_MM = 10.0
 GOOD_DICE = 0.8
+# Of a kidney that touches the array, by place alone: the width of an ellipse against its height.
+ELLIPSE_WIDTH = 1.3
 
 
 def outlined_kidney(
@@ -51,6 +53,14 @@ def outlined_kidney(
     )
     outline = _closed_path(_step_cost(level, reached > 0.5)[:, LEAST_MM : MOST_MM + 1]) + LEAST_MM
     return covered & (away <= np.interp(angle, _angles(), outline, period=2 * np.pi))
+
+
+def outline_by_place(covered: np.ndarray, centre: Sequence[float], pixel_mm: Sequence[float]) -> np.ndarray:
+    """Return an outline (rows, columns) that sees no image: an ellipse about the kidney's centre that touches the array."""
+    row, column = np.indices(covered.shape)
+    height = (centre[0] + 0.5) * pixel_mm[0]
+    down, right = (row - centre[0]) * pixel_mm[0], (column - centre[1]) * pixel_mm[1] / ELLIPSE_WIDTH
+    return covered & (np.hypot(down, right) <= height)
 
 
 def _angles() -> np.ndarray:

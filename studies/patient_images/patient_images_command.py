@@ -35,7 +35,7 @@ COLUMNS = (
     ("agent [dB]", "{agent_db:.1f}"),
     ("behind it", "{behind_agent_db:.1f}"),
     ("outlined", "{outlined:.2f}"),
-    ("if all were kidney", "{all_kidney:.2f}"),
+    ("by place alone", "{outlined_by_place:.2f}"),
 )
 
 
@@ -65,7 +65,7 @@ class PatientImageRow:
     agent_db: float | None
     behind_agent_db: float | None
     outlined: float | None
-    all_kidney: float | None
+    outlined_by_place: float | None
 
 
 @click.command("patient-images")
@@ -101,12 +101,18 @@ def patient_images(patients: tuple[Path, ...], names: tuple[str, ...], out: Path
                 bar.update()
     described = [asdict(row) for row in rows]
     noise = [_noise(name, probe) for name, probe in probes.items()]
-    outlined = float(np.mean([row.outlined for row in rows]))
+    outlined, by_place = np.mean([(row.outlined, row.outlined_by_place) for row in rows], axis=0).tolist()
     text = (
-        f"{table_of(COLUMNS, described)}\n\nOutlined on {100 * outlined:.0f} % of the planes\n\n"
+        f"{table_of(COLUMNS, described)}\n\nOutlined on {100 * outlined:.0f} % of the planes, by place alone on {100 * by_place:.0f} %\n\n"
         f"{table_of(NOISE_COLUMNS, noise)}"
     )
-    report = dict(backend=backend, rows=described, outlined=outlined, speckle_over_noise=noise)
+    report = dict(
+        backend=backend,
+        rows=described,
+        outlined=outlined,
+        outlined_by_place=by_place,
+        speckle_over_noise=noise,
+    )
     write_results(out, "patient-images", report, text, described)
 
 
