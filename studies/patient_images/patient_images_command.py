@@ -101,7 +101,8 @@ def patient_images(patients: tuple[Path, ...], names: tuple[str, ...], out: Path
                 bar.update()
     described = [asdict(row) for row in rows]
     noise = [_noise(name, probe) for name, probe in probes.items()]
-    outlined, by_place = np.mean([(row.outlined, row.outlined_by_place) for row in rows], axis=0).tolist()
+    shares = np.array([(row.outlined, row.outlined_by_place) for row in rows], float)
+    outlined, by_place = shares.mean(axis=0).tolist()
     text = (
         f"{table_of(COLUMNS, described)}\n\nOutlined on {100 * outlined:.0f} % of the planes, by place alone on {100 * by_place:.0f} %\n\n"
         f"{table_of(NOISE_COLUMNS, noise)}"
