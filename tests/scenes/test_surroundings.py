@@ -94,7 +94,8 @@ def test_blood_hardly_brighter_than_the_liver_is_known_in_wide_vessels(side):
     # The median of the liver is 115 HU, so that noise of 8 HU reaches what blood has.
     body, found = made(side, True, *AS_STORED, (("vessel", 138),))
     assert recall(body, found, "vessel", "vessel") > 0.6
-    for organ in ("liver", "spleen", "muscle"):
+    # The organ beside the other kidney is soft tissue like any other.
+    for organ in ("spleen" if side == "left" else "liver", "muscle"):
         assert recall(body, found, organ, "vessel") < 0.01, organ
 
 
