@@ -101,7 +101,7 @@ class Screen:
             before = after
         pytest.fail("the picture does not come to rest")
 
-    def picture(self, within_s: float = 20) -> np.ndarray:
+    def picture(self, within_s: float = 60) -> np.ndarray:
         """What the window shows, saved by its own screenshot key."""
         before = len(self._screenshots())
         end = time.monotonic() + within_s
