@@ -4,7 +4,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from scenes.tissue_classes.fine_grid import CELL_MM, coarse_distance, refined
+from scenes.tissue_classes.fine_grid import cell_voxels, coarse_distance, refined
 
 # Cortex over the pyramids, and the distance of the middles of their bases: 7 to 10 mm, and 7 to 18 pyramids in a kidney (Hansen, Nielsen &
 # Ewertsen 2016, Diagnostics 6, 2).
@@ -76,7 +76,7 @@ def draw_fascia(
 def draw_perimysium(muscle: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
     """Return broken sheets (nx, ny, nz) of connective tissue in muscle, one voxel thick, parallel to its surface."""
     # Noise of one value a cell, between which it is interpolated.
-    step = np.maximum(np.rint(CELL_MM / spacing_mm), 1).astype(int)
+    step = cell_voxels(spacing_mm)
     cells = -(-np.array(muscle.shape) // step)
     noise = np.random.default_rng(SEED).standard_normal(cells, dtype=np.float32)
     noise = ndimage.gaussian_filter(noise, SHEETS_OVER_MM / 2 / (spacing_mm * step))

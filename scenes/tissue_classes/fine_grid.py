@@ -75,10 +75,15 @@ def signed_distance_of(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
 
 def coarse_distance(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
     """Return distances [mm] (nx, ny, nz) of the voxels of a mask from those outside it, computed in cells of about CELL_MM, and interpolated."""
-    step = np.maximum(np.rint(CELL_MM / spacing_mm), 1).astype(int)
+    step = cell_voxels(spacing_mm)
     coarse = mask[tuple(slice(None, None, k) for k in step)]
     distance = refined(ndimage.distance_transform_edt(coarse, sampling=spacing_mm * step), step)
     return distance[tuple(slice(n) for n in mask.shape)]
+
+
+def cell_voxels(spacing_mm: np.ndarray, cell_mm: float = CELL_MM) -> np.ndarray:
+    """Return how many voxels (3,) a cell of about ``cell_mm`` has along each axis."""
+    return np.maximum(np.rint(cell_mm / spacing_mm), 1).astype(int)
 
 
 def repeated(coarse: np.ndarray, step: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -9,7 +9,7 @@ from skimage.measure import block_reduce
 from skimage.segmentation import watershed
 
 from scenes.tissue_classes.bones import spine_middle
-from scenes.tissue_classes.fine_grid import repeated
+from scenes.tissue_classes.fine_grid import cell_voxels, repeated
 from scenes.tissue_classes.vessels import blood
 
 GAS_BELOW_HU, FAT_BELOW_HU, METAL_ABOVE_HU = -300.0, -30.0, 2500.0
@@ -79,7 +79,7 @@ def surroundings(
 def _oral_agent(hu: np.ndarray, bone: np.ndarray, place: Place) -> np.ndarray:
     """Return what was taken for bone, but is contrast agent in the bowel: in front of the spine, and solid, where a bone is a shell."""
     agent = np.zeros(bone.shape, bool)
-    step = _cell_voxels(place)
+    step = cell_voxels(place.spacing_mm, CELL_MM)
     spine = _spine(block_reduce(bone, tuple(step), np.mean) >= 0.5, step, place)
     if spine is None:
         return agent
@@ -95,11 +95,6 @@ def _oral_agent(hu: np.ndarray, bone: np.ndarray, place: Place) -> np.ndarray:
             if (depth > SHELL_MM).sum() > SOLID_SHARE * bright.sum():
                 agent[box] |= piece
     return agent
-
-
-def _cell_voxels(place: Place) -> np.ndarray:
-    """Return how many voxels (3,) a cell of about CELL_MM has along each axis."""
-    return np.maximum(np.rint(CELL_MM / place.spacing_mm), 1).astype(int)
 
 
 def _marrow(hu: np.ndarray, bone: np.ndarray, kidney: np.ndarray, place: Place) -> np.ndarray:
@@ -138,7 +133,7 @@ def _near(mask: np.ndarray, distance_mm: float, place: Place) -> np.ndarray:
     """Return what is within a distance of a mask, by steps of voxels."""
     if not mask.any():
         return mask
-    step = _cell_voxels(place)
+    step = cell_voxels(place.spacing_mm, CELL_MM)
     coarse = block_reduce(mask, tuple(step), np.max)
     near = ndimage.distance_transform_edt(~coarse, sampling=place.spacing_mm * step) <= distance_mm
     return repeated(near, step, mask.shape)
@@ -146,7 +141,7 @@ def _near(mask: np.ndarray, distance_mm: float, place: Place) -> np.ndarray:
 
 def _bodies(hu: np.ndarray, soft: np.ndarray, bone: np.ndarray, place: Place) -> dict[str, np.ndarray]:
     """Return liver, spleen and muscle, soft tissue in large bodies; and fluid."""
-    step = _cell_voxels(place)
+    step = cell_voxels(place.spacing_mm, CELL_MM)
     cell_mm = place.spacing_mm * step
     mean, inside = block_reduce(hu, tuple(step), np.mean), block_reduce(soft, tuple(step), np.mean) >= 0.5
     depth = ndimage.gaussian_filter(ndimage.distance_transform_edt(inside, sampling=cell_mm), 1.0)

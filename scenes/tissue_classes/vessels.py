@@ -3,7 +3,7 @@
 import numpy as np
 from scipy import ndimage
 
-from scenes.tissue_classes.fine_grid import CELL_MM, repeated
+from scenes.tissue_classes.fine_grid import CELL_MM, cell_voxels, repeated
 
 # In the arterial phase the aorta is brighter than this, as bone is. It contains a ball of this radius, and is as long as the CT, as far as that
 # is at least so long: marrow as bright ends at the discs. It is so far in front of the spine's middle, and no farther beside it: there is
@@ -27,7 +27,7 @@ def arterial_aorta(hu: np.ndarray, mm_from_index: np.ndarray, spine_mm: np.ndarr
         spine_mm: the spine's middle (3,).
     """
     spacing = np.linalg.norm(mm_from_index[:3, :3], axis=0)
-    bright, step = hu > ARTERIAL_ABOVE_HU, np.maximum(np.rint(CELL_MM / spacing), 1).astype(int)
+    bright, step = hu > ARTERIAL_ABOVE_HU, cell_voxels(spacing)
     cells = bright[tuple(slice(None, None, k) for k in step)]
     core = ndimage.distance_transform_edt(cells, sampling=spacing * step) >= AORTA_RADIUS_MM
     head_foot = int(np.argmax(np.abs(mm_from_index[2, :3])))
