@@ -24,7 +24,7 @@ from scenes.scene import Scene
 from scenes.surfaces import translated, volume_mm3
 from scenes.terminal import ReportProgress, no_progress
 from sim.embedding import Embedding
-from sim.fields import FieldSet, array_of
+from sim.fields import array_of
 from sim.skinning import Skin
 from ultrasound.crater import Crater
 from ultrasound.probe import Probe
@@ -99,7 +99,6 @@ class Rehearsal(PressedOrgan):
         meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
         self.supports = [_shrunk(translated(mesh, -self.origin), SUPPORT_SUNK_MM) for mesh in meshes]
         progress("Building the model: surfaces")
-        self._fields, self._fields_before, self._score_fields = FieldSet(), FieldSet(), FieldSet()
         self._build_surfaces(self._remains(None))
         self._build_scanner(scanned, acoustics)
         if settles:
@@ -127,19 +126,15 @@ class Rehearsal(PressedOrgan):
 
     def _build_surfaces(self, remains: dict[str, trimesh.Trimesh]) -> None:
         """The surfaces that move with the tissue: of the organ, and of its tumour and other parts by tissue."""
-        # A window may still show those of before this cut, but no longer those of before the last one.
-        self._fields_before.free()
-        self._fields_before, self._fields = self._fields, FieldSet()
         self.tumour = remains.get(TUMOUR)
         self.parts = {tissue: part for tissue, part in remains.items() if tissue != TUMOUR}
-        with self._fields:
-            self.organ_skin = Skin(self.model, self.organ.vertices)
-            self.tumour_skin = self._tumour_border = None
-            if self.tumour is not None:
-                self._tumour_border = Skin(self.model, self.tumour.vertices)
-                drawn = self.tumour.vertices + TUMOUR_LIFT_MM * self.tumour.vertex_normals
-                self.tumour_skin = Skin(self.model, drawn)
-            self.part_skins = {tissue: Skin(self.model, part.vertices) for tissue, part in self.parts.items()}
+        self.organ_skin = Skin(self.model, self.organ.vertices)
+        self.tumour_skin = self._tumour_border = None
+        if self.tumour is not None:
+            self._tumour_border = Skin(self.model, self.tumour.vertices)
+            drawn = self.tumour.vertices + TUMOUR_LIFT_MM * self.tumour.vertex_normals
+            self.tumour_skin = Skin(self.model, drawn)
+        self.part_skins = {tissue: Skin(self.model, part.vertices) for tissue, part in self.parts.items()}
 
     def _build_scanner(self, scanned: ScannedAnatomy | None, acoustics: Future[np.ndarray] | None) -> None:
         image = self.scene.image
@@ -219,9 +214,7 @@ class Rehearsal(PressedOrgan):
             except ResectionError as error:
                 self.score_fault = str(error)
         shown = marks if self.score is None else np.concatenate([self.score.points, self.score.marks])
-        self._score_fields.free()
-        with self._score_fields:
-            self._score_points = Skin(self.model, shown) if len(marks) else None
+        self._score_points = Skin(self.model, shown) if len(marks) else None
 
     def score_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Present places [mm] of the score: points (k, 3) of the closed line, and its marks (n, 3)."""

@@ -1,6 +1,6 @@
 """The section of the organ on the image plane, filled with the colours of what it cuts.
 
-The scene is a parameter: only window.py imports taichi.ui. Lengths in mm.
+The scene is a parameter: graphics_scene.py or software_scene.py. Lengths in mm.
 """
 
 from dataclasses import dataclass

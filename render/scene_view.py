@@ -1,19 +1,18 @@
 """The 3D view: organ, internal structures, support, transducer, image plane and planned sweep in a GGUI scene.
 
-The scene is a parameter: only window.py imports taichi.ui. Lengths in mm.
+The scene is a parameter: graphics_scene.py or software_scene.py. Lengths in mm.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
-import taichi as ti
 
 from render import transducer_shape
 from render.camera import OrbitCamera
 from render.cut_face import CutFace, side_of_eye
 from render.surface_shading import CUT_EDGE_MM, GLASS, SOLID, Cut, DrawnMesh, ShadedSurface
 from render.viewer import Geometry, Guidance, Score, Settings, View
-from sim.fields import field_of, fill
+from sim.fields import field_of, fill, zeros
 
 PLANE_ROWS, PLANE_COLUMNS = 96, 64
 KEY_LIGHT, FILL_LIGHT, AMBIENT = (0.82, 0.80, 0.77), (0.17, 0.19, 0.23), (0.17, 0.17, 0.19)
@@ -188,8 +187,8 @@ class PlanLines:
 
     def __init__(self, edges: np.ndarray) -> None:
         self._edges = edges
-        self._goal = ti.Vector.field(3, ti.f32, len(edges))
-        self._path, self._colours = (ti.Vector.field(3, ti.f32, 2 * MAX_SEGMENTS) for _ in range(2))
+        self._goal = zeros(len(edges), 3, within=1)
+        self._path, self._colours = (zeros(2 * MAX_SEGMENTS, 3, within=1) for _ in range(2))
         self._shown = np.zeros((0, 2, 3)), 0
 
     def draw(self, scene, guidance: Guidance) -> None:
@@ -218,9 +217,7 @@ class ScoreLines:
     """The closed line of the score and its marks; of a line of more than MAX_SCORE points only every n-th is drawn."""
 
     def __init__(self) -> None:
-        self._points, self._colours = (
-            ti.Vector.field(3, ti.f32, 4 * (MAX_SCORE + MAX_MARKS)) for _ in range(2)
-        )
+        self._points, self._colours = (zeros(4 * (MAX_SCORE + MAX_MARKS), 3, within=1) for _ in range(2))
 
     def draw(self, scene, score: Score, toward: np.ndarray) -> None:
         """Draw the lines into a scene, lifted a little off the surface, ``toward`` (3,) the eye."""

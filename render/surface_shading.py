@@ -4,12 +4,15 @@ GGUI shades by Lambert's law alone and blends by vertex alpha without sorting. S
 translucent organ are therefore part of the vertex colours, and faces are sorted farthest first.
 """
 
+from typing import Any
+
 import igl
 import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from sim.fields import array_of, empty_fields, field_of, fields_of, fill, fill_evenly, run_kernel
+from sim.fields import array_of, field_of, fields_of, fill, fill_evenly, zeros
+from sim.kernels import kernel
 
 ORGAN, TINT = (0.66, 0.27, 0.23), (0.27, 0.69, 0.50)
 SOLID, GLASS = 1.0, 0.30
@@ -18,9 +21,7 @@ CUT_EDGE_MM = 0.4
 # A point on the plane of a cut, and the unit normal towards the side that is removed, (3,) each.
 Cut = tuple[np.ndarray, np.ndarray]
 
-Numbers, Indices = ti.types.ndarray(ti.f32, ndim=1), ti.types.ndarray(ti.i32, ndim=1)
-Points, Triangles = ti.types.ndarray(tm.vec3, ndim=1), ti.types.ndarray(tm.ivec3, ndim=1)
-Colours = ti.types.ndarray(tm.vec4, ndim=1)
+Points: Any = ti.types.ndarray(tm.vec3, ndim=1)
 
 
 class DrawnMesh:
@@ -39,7 +40,7 @@ class ShadedSurface:
     """Normals and colours of one triangle mesh whose vertices move.
 
     Args:
-        vertices: ti.Vector.field(3, ti.f32), shape (n,) [mm].
+        vertices: field of 3-vectors, shape (n,) [mm].
         faces: int32, shape (m, 3), normals outward.
         base: red, green, blue in [0, 1].
         gloss: strength of the sheen; 0 is matt.
@@ -51,8 +52,8 @@ class ShadedSurface:
         self.base, self.gloss = base, gloss
         count = vertices.shape[0]
         around, start = igl.vertex_triangle_adjacency(self.faces, count)
-        self.normal, self.colour = empty_fields((count, 3), (count, 4), within=1)
-        (self._tint,) = empty_fields((count,))
+        self.normal, self.colour = zeros(count, 3, within=1), zeros(count, 4, within=1)
+        self._tint = zeros(count)
         self._tinted: np.ndarray | None = None
         self._faces = field_of(self.faces, 1)
         self._start, self._around = fields_of(start, around)
@@ -60,9 +61,34 @@ class ShadedSurface:
     def shade(self, eye, light, opacity: float = SOLID, cut: Cut | None = None) -> None:
         """Update normals and colours. A cut surface is solid."""
         places = eye, light, *(cut if cut is not None else np.zeros((2, 3))), self.base
-        fields = self._faces, self._start, self._around, self._tint, self.vertices, self.normal, self.colour
-        values = np.array(places, np.float32), float(opacity), self.gloss
-        run_kernel(_shade_in_memory, _shade_in_fields, fields, *values)
+        self._shade(np.array(places, np.float32), float(opacity))
+
+    @kernel
+    def _shade(self, places: Points, opacity: float):
+        """``places`` (5,) are the eye, the light, a point of the cut and its normal, and the surface's colour.
+
+        A zero normal cuts nothing; else what is on its side of the plane is transparent.
+        """
+        for v in range(self.vertices.shape[0]):
+            eye, light, cut_point, cut_normal, base = places[0], places[1], places[2], places[3], places[4]
+            vertex = self.vertices[v]
+            total = tm.vec3(0.0)
+            for k in range(self._start[v], self._start[v + 1]):
+                face = self._faces[self._around[k]]
+                a = self.vertices[face[0]]
+                total += (self.vertices[face[1]] - a).cross(self.vertices[face[2]] - a)
+            n = total / ti.max(total.norm(), 1e-12)
+            self.normal[v] = n
+            to_eye = (eye - vertex).normalized()
+            half = ((light - vertex).normalized() + to_eye).normalized()
+            sheen = self.gloss * ti.max(n.dot(half), 0.0) ** 36
+            rim = (1.0 - ti.abs(n.dot(to_eye))) ** 2
+            alpha = ti.min(opacity + (1.0 - opacity) * (0.75 * rim + sheen), 1.0)
+            if cut_normal.norm() > 0.5:
+                # Not clamped: blending clamps each pixel, and a linear alpha is cut along the plane, not along faces.
+                alpha = 0.5 - (vertex - cut_point).dot(cut_normal) / CUT_EDGE_MM
+            tinted = base + self._tint[v] * (tm.vec3(TINT) - base)
+            self.colour[v] = tm.vec4(tinted * (1.0 - 0.25 * rim) + sheen, alpha)
 
     def tint(self, vertices: np.ndarray | None) -> None:
         """Set which vertices (n,) bool are shown in TINT; None for none of them."""
@@ -92,73 +118,3 @@ class ShadedSurface:
         depth = vertices @ ahead.astype(vertices.dtype)
         # By decreasing distance along the view, as blending needs.
         return faces[np.argsort(-depth[faces].sum(axis=1), kind="stable")].reshape(-1)
-
-
-@ti.func
-def _shade(
-    faces: ti.template(),
-    start: ti.template(),
-    around: ti.template(),
-    tint: ti.template(),
-    vertices: ti.template(),
-    normal: ti.template(),
-    colour: ti.template(),
-    places: ti.template(),
-    opacity,
-    gloss,
-):
-    """``places`` (5,) are the eye, the light, a point of the cut and its normal, and the surface's colour.
-
-    A zero normal cuts nothing; else what is on its side of the plane is transparent.
-    """
-    for v in range(vertices.shape[0]):
-        eye, light, cut_point, cut_normal, base = places[0], places[1], places[2], places[3], places[4]
-        total = tm.vec3(0.0)
-        for k in range(start[v], start[v + 1]):
-            face = faces[around[k]]
-            a = vertices[face[0]]
-            total += (vertices[face[1]] - a).cross(vertices[face[2]] - a)
-        n = total / ti.max(total.norm(), 1e-12)
-        normal[v] = n
-        to_eye = (eye - vertices[v]).normalized()
-        half = ((light - vertices[v]).normalized() + to_eye).normalized()
-        sheen = gloss * ti.max(n.dot(half), 0.0) ** 36
-        rim = (1.0 - ti.abs(n.dot(to_eye))) ** 2
-        alpha = ti.min(opacity + (1.0 - opacity) * (0.75 * rim + sheen), 1.0)
-        if cut_normal.norm() > 0.5:
-            # Not clamped: blending clamps each pixel, and a linear alpha is cut along the plane, not along faces.
-            alpha = 0.5 - (vertices[v] - cut_point).dot(cut_normal) / CUT_EDGE_MM
-        tinted = base + tint[v] * (tm.vec3(TINT) - base)
-        colour[v] = tm.vec4(tinted * (1.0 - 0.25 * rim) + sheen, alpha)
-
-
-@ti.kernel
-def _shade_in_memory(
-    faces: Triangles,
-    start: Indices,
-    around: Indices,
-    tint: Numbers,
-    vertices: Points,
-    normal: Points,
-    colour: Colours,
-    places: Points,
-    opacity: float,
-    gloss: float,
-):
-    _shade(faces, start, around, tint, vertices, normal, colour, places, opacity, gloss)
-
-
-@ti.kernel
-def _shade_in_fields(
-    faces: ti.template(),
-    start: ti.template(),
-    around: ti.template(),
-    tint: ti.template(),
-    vertices: ti.template(),
-    normal: ti.template(),
-    colour: ti.template(),
-    places: Points,
-    opacity: float,
-    gloss: float,
-):
-    _shade(faces, start, around, tint, vertices, normal, colour, places, opacity, gloss)

@@ -1,6 +1,6 @@
 """The window, on a screen or off-screen: 3D view, ultrasound panel, sliders, mouse and keys.
 
-The only file that imports taichi.ui. A frame is drawn in this order:
+It and graphics_scene.py alone import taichi.ui. A frame is drawn in this order:
 1. a full-window background image (background_image.py): panel, images, texts; where no graphics card draws, the 3D view too
    (software_scene.py);
 2. elsewhere, invisible quads near the camera, over the panel and the strip, which fill the depth buffer there, so that no organ covers them;
@@ -14,6 +14,7 @@ import time
 from collections import Counter
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import taichi as ti
@@ -23,6 +24,7 @@ from render.background_image import BackgroundImage
 from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
 from render.display import display_available
 from render.gamepad import Gamepad
+from render.graphics_scene import GraphicsScene
 from render.keys import Keys, begin, hold
 from render.scene_view import SceneView
 from render.sliders import boxes_of, draw_sliders
@@ -31,7 +33,6 @@ from render.viewer import SCANNER_GROUPS, Controls, Geometry, Settings, View
 from render.vulkan_device import draws_by_processor
 from render.window_layout import FULL_SIZE, Rect, WindowLayout
 from sim.device import on_cpu
-from sim.fields import FieldSet
 
 ZOOM_S = 0.5
 # How far beside a box of sliders the mouse still takes its edge [pixels], and how far it goes in a drag, in shares of the window.
@@ -90,7 +91,8 @@ class Window:
         except RuntimeError as error:
             raise NoVulkan("no Vulkan driver found: the window and its pictures need one") from error
         atexit.register(self.close)
-        self._canvas, self._scene = self._window.get_canvas(), self._window.get_scene()
+        self._canvas = self._window.get_canvas()
+        self._scene: Any = GraphicsScene(self._window.get_scene())
         self._gui = self._window.get_gui()
         self._view: View | None = None
         self._quit = False
@@ -119,8 +121,7 @@ class Window:
             (self.layout.width, self.layout.height),
         )
         self.camera = OrbitCamera(geometry.bounds, geometry.up, part, size[0] / size[1])
-        with FieldSet() as self._scene_fields:
-            self._scene_view = SceneView(geometry, self.camera)
+        self._scene_view = SceneView(geometry, self.camera)
         self._software = SoftwareScene(self.camera, size) if self._by_processor else None
         self._frame_at = self._scene_at = 0.0
         # Whether `draw_scene` has dealt with the 3D view of the next frame.
@@ -129,10 +130,8 @@ class Window:
 
     def change_geometry(self, geometry: Geometry) -> None:
         """Show other surfaces from now on, with camera and settings as they are."""
-        self._geometry, before = geometry, self._scene_fields
-        with FieldSet() as self._scene_fields:
-            self._scene_view = SceneView(geometry, self.camera, self._scene_view)
-        before.free()
+        self._geometry = geometry
+        self._scene_view = SceneView(geometry, self.camera, self._scene_view)
         self._seen = ()
 
     def prepare(self, view: View) -> None:
@@ -371,7 +370,7 @@ class Window:
         rects = [self.layout.panel, self.layout.title, self.layout.strip, *self._boxes_over_scene()]
         masked = [self.layout.window_coordinates(rect) for rect in rects]
         self._scene_view.draw(self._scene, view, self.settings, masked)
-        self._canvas.scene(self._scene)
+        self._canvas.scene(self._scene.scene)
 
     def _set_camera(self) -> None:
         _, up, ahead = self.camera.axes()
@@ -383,4 +382,4 @@ class Window:
         near, far = self.camera.near_far()
         self._ui_camera.z_near(near)
         self._ui_camera.z_far(far)
-        self._scene.set_camera(self._ui_camera)
+        self._scene.scene.set_camera(self._ui_camera)

@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 
-from sim.fields import array_of, field_of, fill, fill_evenly
+from sim.fields import array_of, field_of, fill, zeros
 from sim.sampling import RestBody
 
 
@@ -17,7 +16,6 @@ class BodyState:
     velocity: np.ndarray
 
 
-@ti.data_oriented
 class Body:
     """Particles or nodes; vectors are float32 fields of shape (n,).
 
@@ -29,10 +27,10 @@ class Body:
     def __init__(self, rest_points: np.ndarray) -> None:
         self.rest_points = np.asarray(rest_points, np.float64)
         self.count = len(rest_points)
-        self.position = ti.Vector.field(3, ti.f32, self.count)
-        self.velocity = ti.Vector.field(3, ti.f32, self.count)
-        self.predicted = ti.Vector.field(3, ti.f32, self.count)
-        self.rest = ti.Vector.field(3, ti.f32, self.count)
+        self.position = zeros(self.count, 3, within=1)
+        self.velocity = zeros(self.count, 3, within=1)
+        self.predicted = zeros(self.count, 3, within=1)
+        self.rest = zeros(self.count, 3, within=1)
         fill((self.rest, self.rest_points))
         self.restore(self.rest_state())
 
@@ -51,7 +49,6 @@ class Body:
         fill((self.position, position), (self.predicted, position), (self.velocity, velocity))
 
 
-@ti.data_oriented
 class ParticleBody(Body):
     """A body of particles. ``contact_radius`` (n,) [mm]: smallest allowed distance of each particle's centre from a shape.
 
@@ -65,5 +62,4 @@ class ParticleBody(Body):
         self.mass_scaling_per_mm = mass_scaling_per_mm
         self.mass_scaled = mass_scaling_per_mm > 0
         if self.mass_scaled:
-            self.mass_scale = ti.field(ti.f32, self.count)
-            fill_evenly(self.mass_scale, 1.0)
+            self.mass_scale = field_of(np.ones(self.count))

@@ -12,7 +12,7 @@ import trimesh
 from scipy.sparse import csr_array
 
 from sim.body import Body
-from sim.fields import field_of, fields_of, fill
+from sim.fields import field_of, fields_of, fill, zeros
 from sim.lattice import Lattice, surface_patches
 from sim.stored_arrays import stored
 
@@ -20,7 +20,6 @@ from sim.stored_arrays import stored
 N_MM = 1e6
 
 
-@ti.data_oriented
 class Capsule:
     """Patches of the surface, each in one cell of the lattice.
 
@@ -33,11 +32,11 @@ class Capsule:
         )
         self.body = body
         self.count = len(nodes)
-        self.node, self.gradient = field_of(nodes, 1), field_of(gradient, 1)
+        self.node, self.gradient = field_of(nodes, 1), field_of(gradient.reshape(-1, 2), 1)
         self.area_mm2, self.share = area, np.ones(self.count)
         self.stiffness_n_mm = stiffness_n_mm
         self.weight = field_of(N_MM * stiffness_n_mm / 3 * area)
-        self.deformation = ti.Matrix.field(3, 2, ti.f32, self.count)
+        self.deformation = zeros(self.count, 3, 2, within=2)
         places = csr_array(
             (np.arange(nodes.size), nodes.ravel(), np.arange(0, nodes.size + 1, 8)),
             shape=(self.count, body.count),
@@ -61,7 +60,7 @@ class Capsule:
         for q in range(self.count):
             u, v = tm.vec3(0.0), tm.vec3(0.0)
             for k in ti.static(range(8)):
-                at, b = self.body.predicted[self.node[q][k]], self.gradient[q, k]
+                at, b = self.body.predicted[self.node[q][k]], self.gradient[8 * q + k]
                 u += b.x * at
                 v += b.y * at
             self.deformation[q] = ti.Matrix.cols([u, v])

@@ -1,4 +1,4 @@
-"""Start Taichi on one backend, without its console output. A new start invalidates all earlier fields."""
+"""Start Taichi on one backend, without its console output."""
 
 import contextlib
 import functools
@@ -17,12 +17,14 @@ from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 BACKENDS = {"cuda": ti.cuda, "vulkan": ti.vulkan, "cpu": ti.cpu}
 FEW_CORES = 4
-# Taichi keeps 100 MB of compiled kernels unless told otherwise. A rehearsal adds 4 MB for each patient and each choice of settings.
+# Taichi keeps 100 MB of compiled kernels unless told otherwise. A choice of settings adds 4 MB.
 CACHE_BYTES = 1 << 30
 COUNTS = 64
 # Taichi gives a thread of a CPU at least so many iterations of a loop. A loop of fewer and longer ones runs over TASK times as many,
 # and does something in every TASK-th.
 TASK = 512
+# The program that Taichi runs, and the backend and options that it was asked for.
+_started: tuple = (None, "", {})
 TEMPORARY = Path(tempfile.gettempdir()) / "nephron" / "kernels"
 
 
@@ -55,12 +57,17 @@ class NoDevice(RuntimeError):
 def start(arch: str = "cpu", **options) -> str:
     """Initialise Taichi on a named backend or ``auto`` (CUDA if available, else the CPU); return the backend's name.
 
-    ``options`` are passed to ``ti.init``. Raises NoDevice.
+    ``options`` are passed to ``ti.init``. Where Taichi already runs so, it goes on, with its compiled kernels; another start invalidates
+    all fields that are not in a CPU's memory. Raises NoDevice.
     """
-    ti.set_logging_level(ti.ERROR)
+    global _started
     if arch == "auto":
         arch = "cuda" if ti.lang.misc.is_arch_supported(ti.cuda) else "cpu"
-    elif arch != "cpu" and not is_available(arch):
+    asked = arch, options
+    if _started == (impl.get_runtime().prog, *asked):
+        return arch
+    ti.set_logging_level(ti.ERROR)
+    if arch != "cpu" and not is_available(arch):
         raise NoDevice(f"this machine has no {arch} device or driver; use --arch cpu or --arch auto")
     if arch != "vulkan":
         # LLVM optimises too: without Taichi's own pass kernels are as fast, and large ones compile ten times as fast.
@@ -77,6 +84,7 @@ def start(arch: str = "cpu", **options) -> str:
         raise NoDevice(
             "the Vulkan driver of this machine gives wrong results, as Mesa 22's software driver does; use --arch cpu, or a newer driver"
         )
+    _started = impl.get_runtime().prog, *asked
     return arch
 
 

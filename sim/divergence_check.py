@@ -12,7 +12,8 @@ import taichi as ti
 import taichi.math as tm
 from scipy.spatial import cKDTree
 
-from sim.fields import field_of, fields_of, fill
+from sim.fields import field_of, fields_of, fill, zeros
+from sim.kernels import kernel
 from sim.solver import Solver, SolverState
 
 MOST_TETRAHEDRA = 2000
@@ -66,7 +67,6 @@ class DivergenceState:
     is_restored: bool = False
 
 
-@ti.data_oriented
 class DivergenceCheck:
     """Checks a solver's body after each step; ``restorations`` counts how often it had to restore a state.
 
@@ -81,12 +81,12 @@ class DivergenceCheck:
         self.serial = solver.model.serial
         rest = self.body.rest_points
         corners = tetrahedra_among(rest)
-        self.count = len(corners)
+        self.count, self.has_tetrahedra = len(corners), len(corners) > 0
         self.middle = ti.Vector(rest.mean(axis=0).tolist())
-        self.farthest = ti.field(ti.f32, ())
+        self.farthest = zeros()
         # Numbers of points that are not finite, and of tangled tetrahedra.
-        self.faults = ti.Vector.field(2, ti.i32, ())
-        if self.count > 0:
+        self.faults = zeros(2, within=1, kind=ti.i32)
+        if self.has_tetrahedra:
             self.per_volume = field_of(np.ones(self.count))
             self.corner, self.longest = fields_of(corners, np.ones((self.count, 3)), within=1)
             self._fill(corners)
@@ -103,7 +103,7 @@ class DivergenceCheck:
     def test_among(self, is_tissue: np.ndarray) -> None:
         """Test only tetrahedra of points that are tissue (n,), as many as before; more of them are tested twice where there are fewer."""
         among = np.flatnonzero(is_tissue)
-        if self.count > 0:
+        if self.has_tetrahedra:
             corners = among[tetrahedra_among(self.body.rest_points[among])]
             self._fill(np.resize(corners, (self.count, 4)))
 
@@ -151,7 +151,7 @@ class DivergenceCheck:
         not_finite, tangled, farthest = self._examine()
         return Health(not_finite == 0, float(farthest), float(tangled) / max(self.count, 1))
 
-    @ti.kernel
+    @kernel
     def _examine(self) -> tm.vec3:
         """Numbers of points that are not finite and of tangled tetrahedra, and the distance of the farthest point."""
         # Counts and maxima do not depend on the order, so these atomics are deterministic.
@@ -164,7 +164,7 @@ class DivergenceCheck:
                 ti.atomic_max(self.farthest[None], distance)
             else:
                 self.faults[None][0] += 1
-        if ti.static(self.count > 0):
+        if ti.static(self.has_tetrahedra):
             ti.loop_config(serialize=self.serial)
             for t in range(self.count):
                 if self.is_tangled(t):

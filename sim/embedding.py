@@ -12,7 +12,8 @@ import taichi.math as tm
 import trimesh
 
 from sim.device import is_too_small
-from sim.fields import field_of, fill
+from sim.fields import Field, field_of, fill, zeros
+from sim.kernels import kernel
 from sim.signed_distance import signed_distance
 from sim.skinning import Skin
 from sim.stored_arrays import stored
@@ -28,7 +29,6 @@ FLAT = 1e-3
 PARALLEL_FROM = 1_000_000
 
 
-@ti.data_oriented
 class Embedding:
     """Tetrahedra of a regular grid around a closed surface, whose vertices move with the tissue model.
 
@@ -46,26 +46,26 @@ class Embedding:
         vertices, tetrahedra, share, at = stored(_embedding_mesh, surface, cell_mm, margin_mm)
         self.skin = Skin(model, vertices, at)
         self.share = field_of(share)
-        self.count = len(tetrahedra)
+        self.count, self.vertices = len(tetrahedra), len(vertices)
         self.serial = is_too_small(self.count, PARALLEL_FROM)
         self.tetrahedron = field_of(tetrahedra, 1)
-        self.on_plane = ti.Vector.field(2, ti.f32, len(vertices))
+        self.on_plane = zeros(len(vertices), 2, within=1)
         # A field of its own: all tetrahedra read it, and so it fits in a core's cache.
-        self.above_plane = ti.field(ti.f32, len(vertices))
-        self.rest_from_plane = ti.Matrix.field(3, 4, ti.f32, self.count + 1)
+        self.above_plane = zeros(len(vertices))
+        self.rest_from_plane = zeros(self.count + 1, 3, 4, within=2)
 
     def update(self) -> None:
         """Move the vertices with the body."""
         self.skin.update()
         self._fade()
 
-    @ti.kernel
+    @kernel
     def _fade(self):
-        for v in self.share:
+        for v in range(self.vertices):
             rest = self.skin.rest[v]
             self.skin.vertices[v] = rest + self.share[v] * (self.skin.vertices[v] - rest)
 
-    @ti.kernel
+    @kernel
     def locate_on_plane(
         self,
         plane_from_world: tm.mat4,
@@ -82,10 +82,11 @@ class Embedding:
         first.x + column * pixel.x, v = first.y + row * pixel.y. Of overlapping tetrahedra the lowest index is taken,
         independent of threads; inverted and flat ones are left out.
         """
-        for pixel in ti.grouped(owner):
-            owner[pixel] = self.count
+        for row in range(rows):
+            for column in range(columns):
+                owner[row, column] = self.count
         self.rest_from_plane[self.count] = world_from_plane[:3, :]
-        for v in self.on_plane:
+        for v in range(self.vertices):
             projected = plane_from_world @ tm.vec4(self.skin.vertices[v], 1.0)
             self.on_plane[v], self.above_plane[v] = projected.xy, projected.z
         ti.loop_config(serialize=self.serial)
@@ -169,7 +170,7 @@ class Unmoved:
     count = 1
 
     def __init__(self) -> None:
-        self.rest_from_plane = ti.Matrix.field(3, 4, ti.f32, 1)
+        self.rest_from_plane = zeros(1, 3, 4, within=2)
 
     def update(self) -> None:
         """Nothing to do."""
@@ -182,7 +183,7 @@ class Unmoved:
         first_mm: ti.Matrix,
         rows: int,
         columns: int,
-        owner: ti.Field,
+        owner: Field,
     ) -> None:
         """As ``Embedding.locate_on_plane``."""
         fill(

@@ -21,7 +21,7 @@ from sim.attachment import total_stiffness
 from sim.body import Body
 from sim.capsule import N_MM, Capsule
 from sim.device import is_too_small
-from sim.fields import field_of, fields_of, fill
+from sim.fields import Field, field_of, fields_of, fill, zeros
 from sim.lattice import CORNERS, Lattice, fill_with_cells, surface_points
 from sim.linear_algebra import cross, four, row, solve
 from sim.material import Material, mixture
@@ -51,7 +51,6 @@ ORGAN = Material()
 LATTICE_SETTINGS = StepSettings(substeps=1, iterations=4, relaxation_factor=1.7, stabilisation_iterations=0)
 
 
-@ti.data_oriented
 class NeoHookean:
     """W = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2 in the elements of a lattice (Bonet & Wood 2008, Eq. 6.27).
 
@@ -137,15 +136,14 @@ class NeoHookean:
         self.has_capsule = capsule is not None
         self.count = len(lattice.cells)
         self.has_relaxation = bool(prony)
-        self.history: dict[str, ti.Field] = {}
+        self.history: dict[str, Field] = {}
         if prony:
             self.relaxation = Relaxation(prony, self.count)
             self.history = self.relaxation.state
         self.most_mm = MOST_CELLS_AN_ITERATION * lattice.cell_mm
-        self.mu = ti.field(ti.f32, ())
-        self.lambda_ = ti.field(ti.f32, ())
-        self.inertial_target = ti.Vector.field(3, ti.f32, body.count)
-        self.predicted = ti.Vector.field(4, ti.f32, body.count)
+        self.mu = self.lambda_ = 0.0
+        self.inertial_target = zeros(body.count, 3, within=1)
+        self.predicted = zeros(body.count, 4, within=1)
         self.parts = tuple(parts)
         self.has_parts = bool(parts)
         density = mixture(material, self.parts, lattice.share)[2]
@@ -169,14 +167,14 @@ class NeoHookean:
             around[cells[:, a], a] = np.arange(self.count)
             for b in range(8):
                 neighbour[cells[:, a], place_of(a, b)] = cells[:, b]
-        self.around, self.neighbour = fields_of(around, neighbour)
+        self.around, self.neighbour = fields_of(around.ravel(), neighbour.ravel())
         self.cell = field_of(cells, 1)
         self.deformation = field_of(np.tile(np.eye(3, 4), (self.count + 1, 1, 1)), 2)
-        self.gradient = ti.Vector.field(4, ti.f32, (nodes, 8))
-        self.shear = ti.field(ti.f32, nodes)
-        self.hourglass = ti.field(ti.f32, (nodes, 27))
+        self.gradient = zeros(8 * nodes, 4, within=1)
+        self.shear = zeros(nodes)
+        self.hourglass = zeros(27 * nodes)
         if self.has_parts:
-            self.lame_ratio = ti.field(ti.f32, self.count + 1)
+            self.lame_ratio = zeros(self.count + 1)
 
     def _fill_stiffness(self, stiffness: np.ndarray) -> None:
         """Fill the fields that contain the shear modulus (m,) of the elements, in units of ``mu``."""
@@ -192,7 +190,9 @@ class NeoHookean:
         shear = (gradient[:, :, 3] * (gradient[:, :, :3] ** 2).sum(axis=2)).sum(axis=1)
         # A node whose elements were all removed stays where it is: it has no force, but needs a stiffness.
         shear[shear == 0.0] = 1.0
-        fill((self.gradient, gradient), (self.shear, shear), (self.hourglass, hourglass))
+        fill(
+            (self.gradient, gradient.reshape(-1, 4)), (self.shear, shear), (self.hourglass, hourglass.ravel())
+        )
 
     def set_material(
         self, young_kpa: float, poisson: float | None = None, parts: Sequence[Material] | None = None
@@ -204,9 +204,9 @@ class NeoHookean:
         poisson = self.material.poisson if poisson is None else poisson
         self.material = replace(self.material, young_kpa=young_kpa, poisson=poisson)
         self.parts = self.parts if parts is None else tuple(parts)
-        self.mu[None], self.lambda_[None] = self.material.mu, self.material.lambda_
+        self.mu, self.lambda_ = self.material.mu, self.material.lambda_
         if self.contacts is not None:
-            self.contacts.stiffness[None] = young_kpa / PENALTY_DEPTH_MM
+            self.contacts.stiffness = young_kpa / PENALTY_DEPTH_MM
         if self.has_parts:
             mu, lambda_, _ = mixture(self.material, self.parts, self.lattice.share)
             self._fill_stiffness(mu / self.material.mu)
@@ -261,7 +261,7 @@ class NeoHookean:
             x, y, z = tm.vec4(0.0), tm.vec4(0.0), tm.vec4(0.0)
             for k in ti.static(range(8)):
                 i = self.cell[c][k]
-                b, at = self.gradient[i, k], four(self.body.predicted[i])
+                b, at = self.gradient[8 * i + k], four(self.body.predicted[i])
                 x += b.x * at
                 y += b.y * at
                 z += b.z * at
@@ -339,11 +339,11 @@ class NeoHookean:
         """Move node i and update the deformation of the elements around it, which no other node of its colour has."""
         self.predicted[i] = self.predicted[i] + change
         for k in range(8):
-            b = self.gradient[i, k]
+            b = self.gradient[8 * i + k]
             # Not "+=", which is atomic.
-            self.deformation[self.around[i, k]] = self.deformation[self.around[i, k]] + ti.Matrix.rows(
-                [b.x * change, b.y * change, b.z * change]
-            )
+            self.deformation[self.around[8 * i + k]] = self.deformation[
+                self.around[8 * i + k]
+            ] + ti.Matrix.rows([b.x * change, b.y * change, b.z * change])
 
     @ti.func
     def elastic(self, i):
@@ -353,21 +353,21 @@ class NeoHookean:
         With B the node's gradient, f = -V (mu F B + (lambda ln J - mu) G / J), where G = dJ/dx = cof(F) B does not
         depend on the node's own position, so that d^2J/dx^2 = 0.
         """
-        mu, lambda_ = self.mu[None], self.lambda_[None]
+        mu, lambda_ = self.mu, self.lambda_
         force = -mu * self.hourglass_gradient(i)
         x, y, z = tm.vec4(0.0), tm.vec4(0.0), tm.vec4(0.0)
         # Shear and hourglass stiffness are isotropic and do not depend on the positions.
-        isotropic = mu * (self.shear[i] + self.hourglass[i, 13])
+        isotropic = mu * (self.shear[i] + self.hourglass[27 * i + 13])
         if ti.static(self.has_relaxation):
             factor = self.relaxation.factor[None]
             isotropic += (factor - 1.0) * mu * self.shear[i]
             mu *= factor
             lambda_ *= factor
         for k in range(8):
-            b = self.gradient[i, k]
-            f = self.deformation[self.around[i, k]]
+            b = self.gradient[8 * i + k]
+            f = self.deformation[self.around[8 * i + k]]
             if ti.static(self.has_parts):
-                lambda_ = mu * self.lame_ratio[self.around[i, k]]
+                lambda_ = mu * self.lame_ratio[self.around[8 * i + k]]
             f1, f2, f3 = row(f, 0), row(f, 1), row(f, 2)
             f23 = cross(f2, f3)
             j = f1.dot(f23)
@@ -377,7 +377,7 @@ class NeoHookean:
             pressure = (lambda_ * (ln(at) + j * one_by - 1.0) - mu) * one_by
             force -= b.w * (mu * (b.x * f1 + b.y * f2 + b.z * f3) + pressure * g)
             if ti.static(self.has_relaxation):
-                past = times(self.relaxation.history[self.around[i, k]], b.xyz)
+                past = times(self.relaxation.history[self.around[8 * i + k]], b.xyz)
                 force -= b.w * (past.x * f1 + past.y * f2 + past.z * f3)
                 isotropic += ti.max(b.w * past.dot(b.xyz), 0.0)
             curvature = lambda_ * one_by * one_by - (pressure * one_by if j > LEAST_J else 0.0)
@@ -393,7 +393,7 @@ class NeoHookean:
         x = self.predicted[i]
         gradient = tm.vec4(0.0)
         for k in range(27):
-            gradient += self.hourglass[i, k] * (self.predicted[self.neighbour[i, k]] - x)
+            gradient += self.hourglass[27 * i + k] * (self.predicted[self.neighbour[27 * i + k]] - x)
         return gradient
 
     @ti.func
@@ -408,7 +408,7 @@ class NeoHookean:
         """Second Piola-Kirchhoff stress S = mu (1 - C^-1) + lambda ln J C^-1 of element c: 11, 22, 33, 12, 13, 23, relative to
         the element's stiffness.
         """
-        mu, lambda_ = self.mu[None], self.lambda_[None]
+        mu, lambda_ = self.mu, self.lambda_
         if ti.static(self.has_parts):
             lambda_ = mu * self.lame_ratio[c]
         f = self.deformation[c]

@@ -5,8 +5,9 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import ParticleBody
-from sim.fields import array_of, fill, fill_evenly
+from sim.fields import array_of, fill, fill_evenly, zeros
 from sim.friction import sticking_fraction, tangential
+from sim.kernels import kernel
 from sim.shapes import FAR, TimeOfImpact
 
 PROJECTION_ITERATIONS = 8
@@ -19,7 +20,6 @@ EXACT_MM = 0.02
 SAFETY = 1e-3
 
 
-@ti.data_oriented
 class ShapeContacts:
     """Contact planes of each particle with each shape, and the displacements by contact in this substep.
 
@@ -35,17 +35,18 @@ class ShapeContacts:
         self.body = body
         self.shapes = list(shapes)
         self.time_of_impact = TimeOfImpact(shapes)
-        self.friction = friction
+        self.friction, self.has_friction = friction, friction > 0
         self.margin = body.radius_mm / 2
         self.reuse_mm = body.radius_mm / 4
         # Distances beyond the reach of a shape are unknown, so no larger distance is stored.
         self.reach = REACH_RADII * body.radius_mm
-        parts = {"plane": tm.vec4, "push": tm.vec4} if self.friction > 0 else {"plane": tm.vec4}
-        self.contact = ti.Struct.field(parts, shape=(body.count, len(shapes)))
-        self.touched = ti.field(ti.i32, body.count)
-        self.found = ti.Vector.field(4, ti.f32, (body.count, len(shapes)))
+        self.plane = zeros(body.count, len(shapes), 4, within=1)
+        if self.has_friction:
+            self.push = zeros(body.count, len(shapes), 4, within=1)
+        self.touched = zeros(body.count, kind=ti.i32)
+        self.found = zeros(body.count, len(shapes), 4, within=1)
         self.reset()
-        self.penetration = ti.field(ti.f32, ())
+        self.penetration = zeros()
 
     def reset(self) -> None:
         """Clear stored distances; call it after other code has moved the particles."""
@@ -53,11 +54,11 @@ class ShapeContacts:
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """A copy of what persists from step to step: contact planes, and where they were found."""
-        return dict(plane=array_of(self.contact.plane), found=array_of(self.found))
+        return dict(plane=array_of(self.plane), found=array_of(self.found))
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Restore a snapshot; the steps that follow give the same bits."""
-        fill((self.contact.plane, state["plane"]), (self.found, state["found"]))
+        fill((self.plane, state["plane"]), (self.found, state["found"]))
 
     @ti.func
     def is_clear(self, s: ti.template(), i, p, distance):
@@ -81,10 +82,8 @@ class ShapeContacts:
             if (p - self.found[i, s].xyz).norm_sqr() > reuse_mm * reuse_mm:
                 near = self.shapes[s].surface(p)
                 self.found[i, s] = tm.vec4(p, ti.min(near.w, self.reach))
-                self.contact[i, s].plane = tm.vec4(
-                    near.xyz, near.xyz.dot(p) - near.w + self.body.contact_radius[i]
-                )
-            plane = self.contact[i, s].plane
+                self.plane[i, s] = tm.vec4(near.xyz, near.xyz.dot(p) - near.w + self.body.contact_radius[i])
+            plane = self.plane[i, s]
             result = tm.vec4(plane.xyz, plane.xyz.dot(p) - plane.w + self.body.contact_radius[i])
         return result
 
@@ -102,11 +101,11 @@ class ShapeContacts:
                     if near.w < reach:
                         touched |= 1 << s
                         if ti.static(self.shapes[s].moves):
-                            self.contact[i, s].plane = tm.vec4(
+                            self.plane[i, s] = tm.vec4(
                                 near.xyz, near.xyz.dot(p) - near.w + self.body.contact_radius[i]
                             )
-                        if ti.static(self.friction > 0):
-                            self.contact[i, s].push = tm.vec4(0.0)
+                        if ti.static(self.has_friction):
+                            self.push[i, s] = tm.vec4(0.0)
             self.touched[i] = touched
 
     @ti.func
@@ -120,7 +119,7 @@ class ShapeContacts:
     @ti.func
     def depth(self, s: ti.template(), i, x):
         """Depth [mm] of particle i, at x, below the contact plane of shape s; negative outside."""
-        plane = self.contact[i, s].plane
+        plane = self.plane[i, s]
         depth = plane.w - plane.xyz.dot(x)
         return depth if (self.touched[i] >> s) & 1 else -FAR
 
@@ -135,7 +134,7 @@ class ShapeContacts:
                     for s in ti.static(range(len(self.shapes))):
                         depth = self.depth(s, i, x + moved)
                         if depth > 0.0:
-                            change += depth * self.contact[i, s].plane.xyz
+                            change += depth * self.plane[i, s].xyz
                             active += 1
                     moved += change / ti.cast(ti.max(active, 1), ti.f32)
                 self.body.position[i] = x + moved
@@ -155,10 +154,10 @@ class ShapeContacts:
         change = tm.vec3(0.0)
         for s in ti.static(range(len(self.shapes))):
             if (touched >> s) & 1:
-                normal = self.contact[i, s].plane.xyz
+                normal = self.plane[i, s].xyz
                 depth = factor * ti.max(self.depth(s, i, x), 0.0)
                 change += depth * normal
-                if ti.static(self.friction > 0):
+                if ti.static(self.has_friction):
                     change += self.friction_change(s, i, x, normal, depth, factor)
         return change
 
@@ -166,8 +165,8 @@ class ShapeContacts:
     def pushes(self, s: ti.template(), i, x):
         """Whether shape s displaces particle i, at x, or has done so in this substep."""
         result = self.depth(s, i, x) > 0.0
-        if ti.static(self.friction > 0):
-            result |= (self.touched[i] >> s) & 1 and self.contact[i, s].push.w > 0.0
+        if ti.static(self.has_friction):
+            result |= (self.touched[i] >> s) & 1 and self.push[i, s].w > 0.0
         return result
 
     @ti.func
@@ -177,7 +176,7 @@ class ShapeContacts:
         It opposes the tangential motion since the start of the substep, relative to the shape's motion (Macklin et al.
         2014, Eq. 24), up to the coefficient times the total normal displacement.
         """
-        push = self.contact[i, s].push
+        push = self.push[i, s]
         normal_push = push.w + depth
         change = tm.vec3(0.0)
         if normal_push > 0.0:
@@ -185,7 +184,7 @@ class ShapeContacts:
             friction = push.xyz - factor * slip
             friction *= sticking_fraction(friction, self.friction * normal_push)
             change = friction - push.xyz
-            self.contact[i, s].push = tm.vec4(friction, normal_push)
+            self.push[i, s] = tm.vec4(friction, normal_push)
         return change
 
     @ti.func
@@ -239,7 +238,7 @@ class ShapeContacts:
             depth = ti.max(depth, -self.shapes[s].surface(x).w)
         return depth
 
-    @ti.kernel
+    @kernel
     def measure_penetration(self) -> float:
         """Largest depth [mm] of a particle's centre in a shape, 0 without penetration."""
         self.penetration[None] = 0.0

@@ -11,6 +11,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import Body
+from sim.fields import Field, zeros
 from sim.linear_algebra import axial, cross_matrix, inverse_of, rotation_by
 from sim.surface_contact import NEAR_MM, SurfaceContacts
 
@@ -44,6 +45,57 @@ Moments = ti.types.struct(
 )
 
 
+class SumsField:
+    """``Sums`` of each of ``count`` blocks."""
+
+    def __init__(self, count: int) -> None:
+        self.force, self.torque = (zeros(count, 3, within=1) for _ in range(2))
+        self.translational, self.mixed, self.rotational = (zeros(count, 3, 3, within=2) for _ in range(3))
+
+    @ti.func
+    def store(self, block, sums):
+        self.force[block], self.torque[block] = sums.force, sums.torque
+        self.translational[block], self.mixed[block] = sums.translational, sums.mixed
+        self.rotational[block] = sums.rotational
+
+    @ti.func
+    def of(self, block):
+        return Sums(
+            self.force[block],
+            self.torque[block],
+            self.translational[block],
+            self.mixed[block],
+            self.rotational[block],
+        )
+
+
+class MomentsField:
+    """``Moments`` of each of ``count`` blocks."""
+
+    def __init__(self, count: int) -> None:
+        self.stiffness = zeros(count)
+        self.arm, self.shift, self.force, self.torque = (zeros(count, 3, within=1) for _ in range(4))
+        self.arm_arm, self.shift_arm = (zeros(count, 3, 3, within=2) for _ in range(2))
+
+    @ti.func
+    def store(self, block, sums):
+        self.stiffness[block], self.arm[block], self.shift[block] = sums.stiffness, sums.arm, sums.shift
+        self.arm_arm[block], self.shift_arm[block] = sums.arm_arm, sums.shift_arm
+        self.force[block], self.torque[block] = sums.force, sums.torque
+
+    @ti.func
+    def of(self, block):
+        return Moments(
+            self.stiffness[block],
+            self.arm[block],
+            self.shift[block],
+            self.arm_arm[block],
+            self.shift_arm[block],
+            self.force[block],
+            self.torque[block],
+        )
+
+
 @ti.func
 def no_sums():
     """Sums of no terms."""
@@ -56,7 +108,6 @@ def no_moments():
     return Moments(0.0, tm.vec3(0.0), tm.vec3(0.0), tm.mat3(0.0), tm.mat3(0.0), tm.vec3(0.0), tm.vec3(0.0))
 
 
-@ti.data_oriented
 class RigidCorrection:
     """Moves a body's predicted positions rigidly towards ``inertial_target`` (n,) [mm], weighted with ``mass`` (n,) [g],
     and to the places at rest to which a ``tether`` (n,) [g/s^2] holds.
@@ -68,11 +119,11 @@ class RigidCorrection:
     def __init__(
         self,
         body: Body,
-        mass: ti.Field,
-        inertial_target: ti.Field,
+        mass: Field,
+        inertial_target: Field,
         contacts: SurfaceContacts | None = None,
         serial: bool = False,
-        tether: ti.Field | None = None,
+        tether: Field | None = None,
     ) -> None:
         self.body = body
         self.mass = mass
@@ -86,16 +137,15 @@ class RigidCorrection:
         self.contact_blocks = -(-contacts.count // BLOCK) if contacts else 0
         middle = body.rest_points.mean(axis=0)
         self.centre = int(np.linalg.norm(body.rest_points - middle, axis=1).argmin())
-        self.moments = Moments.field(shape=self.blocks)
-        self.total_moments = Moments.field(shape=())
+        self.moments, self.total_moments = MomentsField(self.blocks), MomentsField(1)
         if self.has_contacts:
-            self.contact_sums = Sums.field(shape=self.contact_blocks)
+            self.contact_sums = SumsField(self.contact_blocks)
         # Largest distance of a node from the centre at rest.
         self.extent_mm = float(np.linalg.norm(body.rest_points - middle, axis=1).max())
-        self.rotation = ti.Matrix.field(3, 3, ti.f32, ())
-        self.translation = ti.Vector.field(3, ti.f32, ())
-        self.change_mm = ti.field(ti.f32, ())
-        self.fraction = ti.field(ti.f32, ())
+        self.rotation = zeros(3, 3, within=2)
+        self.translation = zeros(3, within=1)
+        self.change_mm = zeros()
+        self.fraction = zeros()
 
     @ti.func
     def move(self, dt: float):
@@ -157,14 +207,14 @@ class RigidCorrection:
             sums.shift_arm += shift.outer_product(arm)
             sums.force += push
             sums.torque += arm.cross(push)
-        self.moments[block] = sums
+        self.moments.store(block, sums)
 
     @ti.func
     def begin(self):
         """Add the blocks' moments; no motion yet."""
         total = no_moments()
         for block in range(self.blocks):
-            each = self.moments[block]
+            each = self.moments.of(block)
             total.stiffness += each.stiffness
             total.arm += each.arm
             total.shift += each.shift
@@ -172,7 +222,7 @@ class RigidCorrection:
             total.shift_arm += each.shift_arm
             total.force += each.force
             total.torque += each.torque
-        self.total_moments[None] = total
+        self.total_moments.store(0, total)
         self.rotation[None] = tm.eye(3)
         self.translation[None] = tm.vec3(0.0)
 
@@ -188,7 +238,7 @@ class RigidCorrection:
     @ti.func
     def node_sums(self, has_forces):
         """Forces of the nodes, and their derivatives: a node at R a is pulled towards a + d, both relative to the moved centre."""
-        of, rotation, translation = self.total_moments[None], self.rotation[None], self.translation[None]
+        of, rotation, translation = self.total_moments.of(0), self.rotation[None], self.translation[None]
         arm = rotation @ of.arm
         arm_arm = rotation @ of.arm_arm @ rotation.transpose()
         force, torque = of.force, of.torque
@@ -215,7 +265,7 @@ class RigidCorrection:
                 sums.translational += k
                 sums.mixed -= k @ arm
                 sums.rotational -= arm @ k @ arm
-        self.contact_sums[block] = sums
+        self.contact_sums.store(block, sums)
 
     @ti.func
     def solve(self, has_forces):
@@ -223,7 +273,7 @@ class RigidCorrection:
         total = self.node_sums(has_forces)
         if ti.static(self.has_contacts):
             for block in range(self.contact_blocks):
-                sums = self.contact_sums[block]
+                sums = self.contact_sums.of(block)
                 total.force += sums.force
                 total.torque += sums.torque
                 total.translational += sums.translational

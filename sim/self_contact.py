@@ -3,7 +3,7 @@
 import taichi as ti
 import taichi.math as tm
 
-from sim.fields import field_of
+from sim.fields import field_of, zeros
 from sim.friction import sticking_fraction, tangential
 from sim.shape_matching import ShapeMatching
 
@@ -11,7 +11,6 @@ MOST_NEIGHBOURS = 24
 CELLS = 1 << 15
 
 
-@ti.data_oriented
 class SelfContacts:
     """Keeps pairs of particles that share no cluster at least one particle radius apart, their distance in the sampling.
 
@@ -23,18 +22,18 @@ class SelfContacts:
         self.body = body = model.body
         self.model = model
         self.relax_globally = model.relaxation == "global"
-        self.friction = friction
+        self.friction, self.has_friction = friction, friction > 0
         self.distance = body.radius_mm
         # Particles approach each other during the substep, so some are listed before they touch.
         self.reach = 1.5 * self.distance
         self.patch = field_of(model.patches.of_particles())
-        self.cell_start = ti.field(ti.i32, CELLS + 1)
-        self.cell_count = ti.field(ti.i32, CELLS)
-        self.sorted = ti.field(ti.i32, body.count)
-        self.neighbour = ti.field(ti.i32, (body.count, MOST_NEIGHBOURS))
-        self.neighbour_count = ti.field(ti.i32, body.count)
-        self.change = ti.Vector.field(3, ti.f32, body.count)
-        self.most_contacts = ti.field(ti.i32, ())
+        self.cell_start = zeros(CELLS + 1, kind=ti.i32)
+        self.cell_count = zeros(CELLS, kind=ti.i32)
+        self.sorted = zeros(body.count, kind=ti.i32)
+        self.neighbour = zeros(body.count, MOST_NEIGHBOURS, kind=ti.i32)
+        self.neighbour_count = zeros(body.count, kind=ti.i32)
+        self.change = zeros(body.count, 3, within=1)
+        self.most_contacts = zeros(kind=ti.i32)
 
     @ti.func
     def cell_of(self, p):
@@ -134,7 +133,7 @@ class SelfContacts:
                         weight = self.body.mass_scale[j] / (self.body.mass_scale[i] + self.body.mass_scale[j])
                     depth = self.distance - gap
                     change += weight * depth * normal
-                    if ti.static(self.friction > 0):
+                    if ti.static(self.has_friction):
                         slip = tangential(moved - (self.body.predicted[j] - self.body.position[j]), normal)
                         factor = sticking_fraction(slip, self.friction * depth)
                         change -= weight * factor * slip

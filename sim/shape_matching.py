@@ -14,7 +14,8 @@ from scipy.spatial import cKDTree
 
 from sim.body import ParticleBody
 from sim.device import is_too_small
-from sim.fields import field_of, fields_of
+from sim.fields import field_of, fields_of, zeros
+from sim.kernels import kernel
 from sim.linear_algebra import four, rotation_near, row
 from sim.particle_contact import REACH_RADII, ShapeContacts
 from sim.sampling import Patches, RestBody, fill_body, group_into_patches
@@ -29,7 +30,6 @@ LEAST_SQUARED_MM2 = 1e-6
 PARALLEL_PARTICLES = 100_000
 
 
-@ti.data_oriented
 class ShapeMatching:
     """Clusters of a body's particles and their current frames.
 
@@ -94,15 +94,15 @@ class ShapeMatching:
         self.member_start, self.member, self.multi_end = fields_of(
             members.indptr, members.indices, members.indptr[:-1] + multi.astype(np.int32)
         )
-        self.predicted = ti.Vector.field(4, ti.f32, self.body.count)
-        self.goal = ti.Matrix.field(4, 4, ti.f32, self.patch_count)
-        self.centre = ti.Vector.field(4, ti.f32, self.patch_count)
-        self.moment = ti.Matrix.field(4, 4, ti.f32, self.patch_count)
-        self.sum = ti.Matrix.field(4, 4, ti.f32, self.count)
+        self.predicted = zeros(self.body.count, 4, within=1)
+        self.goal = zeros(self.patch_count, 4, 4, within=2)
+        self.centre = zeros(self.patch_count, 4, within=1)
+        self.moment = zeros(self.patch_count, 4, 4, within=2)
+        self.sum = zeros(self.count, 4, 4, within=2)
         if self.has_contacts:
-            self.touched = ti.field(ti.i32, self.patch_count)
+            self.touched = zeros(self.patch_count, kind=ti.i32)
             self.patch = field_of(patches.of_particles())
-        self.frame = ti.Matrix.field(4, 4, ti.f32, self.count)
+        self.frame = zeros(self.count, 4, 4, within=2)
 
     def _store_rest(self, patches: Patches) -> None:
         shared, sizes = patches.cluster_counts, patches.sizes
@@ -320,7 +320,7 @@ class ShapeMatching:
                     moment = self.moment[p]
                 self.add_moment(p, self.centre[p], moment, sums)
 
-    @ti.kernel
+    @kernel
     def update_frames(self):
         """Fit the frames to the current positions, for ``carried``, independently of earlier frames."""
         if ti.static(self.serial):

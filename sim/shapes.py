@@ -12,7 +12,7 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from sim.fields import array_of, field_of, fill
+from sim.fields import array_of, field_of, fill, zeros
 from sim.signed_distance import distance_grid
 
 FAR = 1e6
@@ -29,7 +29,6 @@ TRACING_STEPS = 32
 LEAST_STEP_MM = 0.01
 
 
-@ti.data_oriented
 class StaticShape:
     """A shape that does not move."""
 
@@ -44,7 +43,6 @@ class StaticShape:
         return False
 
 
-@ti.data_oriented
 class Plane(StaticShape):
     """Half-space below the points with normal . x = offset [mm]."""
 
@@ -62,7 +60,6 @@ class Plane(StaticShape):
         return self.normal.dot(p) - self.offset
 
 
-@ti.data_oriented
 class SignedDistanceField(StaticShape):
     """Distances [mm] on a regular grid, negative inside, linear in between; out of reach beyond the grid.
 
@@ -130,7 +127,6 @@ def interpolated(ends, t):
     return ends[0] + t * (ends[1] - ends[0])
 
 
-@ti.data_oriented
 class ConvexTool:
     """A rigid tool that moves: the intersection of half-spaces normal . x <= offset in its own frame.
 
@@ -147,9 +143,9 @@ class ConvexTool:
         core = np.column_stack([normals, np.asarray(offsets_mm, float) - self.edge_radius])
         self.half_space = field_of(core, 1)
         self.ball_mm = self.edge_radius + _farthest_vertex(core)
-        self.pose = ti.Matrix.field(4, 4, ti.f32, ())
-        self.step_back = ti.Matrix.field(4, 4, ti.f32, ())
-        self.path = ti.Matrix.field(4, 4, ti.f32, (MOST_SUBSTEPS, 2))
+        self.pose = zeros(4, 4, within=2)
+        self.step_back = zeros(4, 4, within=2)
+        self.path = zeros(MOST_SUBSTEPS, 2, 4, 4, within=2)
         self.move(np.eye(4), np.eye(4))
 
     @staticmethod
@@ -238,7 +234,6 @@ class ConvexTool:
         return tm.vec4(rotation @ normal, depth - self.edge_radius)
 
 
-@ti.data_oriented
 class TimeOfImpact:
     """Time of impact with the static shapes, as a fraction of a path, by sphere tracing (Hart 1996)."""
 

@@ -1,10 +1,9 @@
 """Skinning: points that move with a tissue model, such as surfaces, beads and the vertices of the embedding."""
 
 import numpy as np
-import taichi as ti
-import taichi.math as tm
 
-from sim.fields import fields_of, fill, run_kernel
+from sim.fields import fields_of, fill
+from sim.kernels import kernel
 from sim.tissue_model import TissueModel
 
 
@@ -20,6 +19,7 @@ class Skin:
         self.at = points if at is None else np.asarray(at, np.float64)
         frame, weight = model.attach(self.at)
         self.model = model
+        self.count = len(points)
         given = points, points, frame, weight
         self.vertices, self.rest, self.frame, self.weight = fields_of(*given, within=1)
         self.update()
@@ -31,36 +31,9 @@ class Skin:
 
     def update(self) -> None:
         """Move the points with the model's current frames."""
-        fields = self.rest, self.frame, self.weight, self.vertices
-        run_kernel(_carry_in_memory, _carry_in_fields, fields, self.model, self.frame.n)
+        self._carry()
 
-
-@ti.kernel
-def _carry_in_memory(
-    rest: ti.types.ndarray(ti.f32, ndim=2),
-    frame: ti.types.ndarray(ti.i32, ndim=2),
-    weight: ti.types.ndarray(ti.f32, ndim=2),
-    out: ti.types.ndarray(ti.f32, ndim=2),
-    model: ti.template(),
-    frames: ti.template(),
-):
-    for v in range(rest.shape[0]):
-        at = tm.vec3(rest[v, 0], rest[v, 1], rest[v, 2])
-        own = ti.Vector([frame[v, k] for k in ti.static(range(frames))])
-        share = ti.Vector([weight[v, k] for k in ti.static(range(frames))])
-        carried = model.carried(at, own, share)
-        for axis in ti.static(range(3)):
-            out[v, axis] = carried[axis]
-
-
-@ti.kernel
-def _carry_in_fields(
-    rest: ti.template(),
-    frame: ti.template(),
-    weight: ti.template(),
-    out: ti.template(),
-    model: ti.template(),
-    frames: ti.template(),
-):
-    for v in rest:
-        out[v] = model.carried(rest[v], frame[v], weight[v])
+    @kernel
+    def _carry(self):
+        for v in range(self.count):
+            self.vertices[v] = self.model.carried(self.rest[v], self.frame[v], self.weight[v])

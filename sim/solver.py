@@ -9,8 +9,10 @@ import taichi.math as tm
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from sim import fields
 from sim.body import BodyState
 from sim.fields import array_of, fill, fill_evenly
+from sim.kernels import kernel
 from sim.self_contact import SelfContacts
 from sim.shapes import MOST_SUBSTEPS, ConvexTool
 from sim.tissue_model import TissueModel
@@ -45,7 +47,6 @@ class SolverState:
     history: dict[str, np.ndarray]
 
 
-@ti.data_oriented
 class Solver:
     """Steps one body with its tissue model and contacts with shapes, and optionally self-contact and a moving tool.
 
@@ -66,7 +67,7 @@ class Solver:
         self.has_tool = tool is not None
         self.has_contacts = model.contacts is not None
         self.has_self_contacts = self_contacts is not None
-        self.history: dict[str, ti.Field] = getattr(model, "history", {})
+        self.history: dict[str, fields.Field] = getattr(model, "history", {})
         self.has_history = bool(self.history)
 
     def step(self, settings: StepSettings, tool_poses: np.ndarray | None = None) -> None:
@@ -124,7 +125,7 @@ class Solver:
         fill(*((field, state.history[name]) for name, field in self.history.items()))
         self.model.update_frames()
 
-    @ti.kernel
+    @kernel
     def advance(
         self,
         dt: float,
@@ -148,7 +149,7 @@ class Solver:
                 self.correct(stiffness, factor, dt)
             self.finish(dt)
 
-    @ti.kernel
+    @kernel
     def launch(
         self,
         part: ti.template(),

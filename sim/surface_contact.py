@@ -11,8 +11,9 @@ import taichi.math as tm
 from scipy.sparse import csr_array
 
 from sim.body import Body
-from sim.fields import array_of, fields_of, fill, fill_evenly
+from sim.fields import array_of, fields_of, fill, fill_evenly, zeros
 from sim.friction import sticking_fraction, tangential
+from sim.kernels import kernel
 from sim.lattice import Lattice
 from sim.shapes import FAR, TimeOfImpact
 
@@ -30,7 +31,6 @@ BLOCK = 64
 REACH_MM = 6.0
 
 
-@ti.data_oriented
 class SurfaceContacts:
     """Contact points on the surface, each interpolated from 8 nodes, and their contacts; at most 31 shapes.
 
@@ -51,28 +51,26 @@ class SurfaceContacts:
         self.body = body
         self.shapes = list(shapes)
         self.time_of_impact = TimeOfImpact(shapes)
-        self.friction = friction
-        self.coefficient = ti.field(ti.f32, ())
-        self.coefficient[None] = friction
+        self.coefficient, self.has_friction = friction, friction > 0
         self.count = len(points)
         self.rest_points, self.rest_area_mm2 = points, area_mm2
-        self.point = ti.Vector.field(3, ti.f32, self.count)
-        self.start = ti.Vector.field(3, ti.f32, self.count)
-        self.near = ti.field(ti.i32, self.count)
+        self.point = zeros(self.count, 3, within=1)
+        self.start = zeros(self.count, 3, within=1)
+        self.near = zeros(self.count, kind=ti.i32)
         nodes, weights, *by_node = self._interpolation(lattice, points)
         self.node, self.weight = fields_of(nodes, weights, within=1)
         self.area, self.node_start, self.node_point, self.node_weight = fields_of(area_mm2, *by_node)
-        self.plane = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
-        self.found = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
+        self.plane = zeros(len(shapes), self.count, 4, within=1)
+        self.found = zeros(len(shapes), self.count, 4, within=1)
         self.state = dict(point=self.point, near=self.near, plane=self.plane, found=self.found)
-        if self.friction > 0:
-            self.slip = ti.Vector.field(3, ti.f32, (len(shapes), self.count))
+        if self.has_friction:
+            self.slip = zeros(len(shapes), self.count, 3, within=1)
             # The name in session files.
             self.state["stick"] = self.slip
-        self.stiffness = ti.field(ti.f32, ())
-        self.penetration = ti.field(ti.f32, ())
+        self.stiffness = 0.0
+        self.penetration = zeros()
         self.blocks = -(-self.count // BLOCK)
-        self.block_wrench = ti.Vector.field(6, ti.f32, self.blocks)
+        self.block_wrench = zeros(self.blocks, 6, within=1)
         self.reset()
 
     def _interpolation(self, lattice: Lattice, points: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -90,7 +88,7 @@ class SurfaceContacts:
         self.rest_points, self.rest_area_mm2 = points, area_mm2
         fields = self.node, self.weight, self.node_start, self.node_point, self.node_weight
         fill((self.area, area_mm2), *zip(fields, self._interpolation(lattice, points), strict=True))
-        if self.friction > 0:
+        if self.has_friction:
             now = array_of(self.node), array_of(self.weight)
             moved = np.any([(a != b).any(axis=1) for a, b in zip(before, now, strict=True)], axis=0)
             slip = array_of(self.slip)
@@ -101,7 +99,7 @@ class SurfaceContacts:
         """Clear stored distances and friction; call it after other code has moved the body."""
         fill_evenly(self.found, -FAR)
         fill_evenly(self.near, 0)
-        if self.friction > 0:
+        if self.has_friction:
             fill_evenly(self.slip, 0.0)
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -162,7 +160,7 @@ class SurfaceContacts:
         normal = self.plane[s, q].xyz
         p = self.point[q]
         slip = tangential(self.slip[s, q] + p - self.start[q] - self.shapes[s].motion(p), normal)
-        fraction = sticking_fraction(slip, self.coefficient[None] * depth / TANGENTIAL_RATIO)
+        fraction = sticking_fraction(slip, self.coefficient * depth / TANGENTIAL_RATIO)
         return slip * fraction, fraction
 
     @ti.func
@@ -173,14 +171,14 @@ class SurfaceContacts:
             q = self.node_point[k]
             if self.near[q] > 0:
                 weight = self.node_weight[k]
-                penalty = weight * 1e3 * self.stiffness[None] * self.area[q]
+                penalty = weight * 1e3 * self.stiffness * self.area[q]
                 for s in ti.static(range(len(self.shapes))):
                     depth = self.depth(s, q)
                     if depth > 0.0:
                         normal = self.plane[s, q].xyz
                         force += penalty * depth * normal
                         tangential = 0.0
-                        if ti.static(self.friction > 0):
+                        if ti.static(self.has_friction):
                             slip, factor = self.tangential_slip(s, q, depth)
                             force -= penalty * TANGENTIAL_RATIO * slip
                             tangential = TANGENTIAL_RATIO * factor
@@ -199,7 +197,7 @@ class SurfaceContacts:
         more than the derivative: so Newton's method converges.
         """
         force, stiffness = tm.vec3(0.0), tm.mat3(0.0)
-        penalty = 1e3 * self.stiffness[None] * self.area[q]
+        penalty = 1e3 * self.stiffness * self.area[q]
         for s in ti.static(range(len(self.shapes))):
             plane = self.plane[s, q]
             normal = plane.xyz
@@ -209,9 +207,9 @@ class SurfaceContacts:
                 stiffness += penalty * normal.outer_product(normal)
                 if has_force:
                     force += penalty * depth * normal
-                    if ti.static(self.friction > 0):
+                    if ti.static(self.has_friction):
                         slip = tangential(self.slip[s, q] + shift - self.point[q], normal)
-                        factor = sticking_fraction(slip, self.coefficient[None] * depth / TANGENTIAL_RATIO)
+                        factor = sticking_fraction(slip, self.coefficient * depth / TANGENTIAL_RATIO)
                         force -= penalty * TANGENTIAL_RATIO * factor * slip
                         stiffness += (
                             penalty * TANGENTIAL_RATIO * factor * (tm.eye(3) - normal.outer_product(normal))
@@ -232,7 +230,7 @@ class SurfaceContacts:
     @ti.func
     def finish(self):
         """End of a substep: store the tangential slip."""
-        if ti.static(self.friction > 0):
+        if ti.static(self.has_friction):
             for q in range(self.count):
                 for s in ti.static(range(len(self.shapes))):
                     slip = tm.vec3(0.0)
@@ -249,7 +247,7 @@ class SurfaceContacts:
         self._sum_forces(self.shapes.index(shape), *about.tolist())
         return -1e-6 * array_of(self.block_wrench).sum(axis=0, dtype=np.float64)
 
-    @ti.kernel
+    @kernel
     def _sum_forces(self, s: ti.template(), x: float, y: float, z: float):
         """Force [uN] of shape s on the points of each block, and its torque [uN mm]."""
         for block in range(self.blocks):
@@ -258,15 +256,15 @@ class SurfaceContacts:
                 depth = self.depth(s, q)
                 if depth > 0.0:
                     pressure = depth * self.plane[s, q].xyz
-                    if ti.static(self.friction > 0):
+                    if ti.static(self.has_friction):
                         pressure -= TANGENTIAL_RATIO * self.slip[s, q]
-                    at_point = 1e3 * self.stiffness[None] * self.area[q] * pressure
+                    at_point = 1e3 * self.stiffness * self.area[q] * pressure
                     force += at_point
                     torque += (self.point[q] - tm.vec3(x, y, z)).cross(at_point)
             for k in ti.static(range(3)):
                 self.block_wrench[block][k], self.block_wrench[block][k + 3] = force[k], torque[k]
 
-    @ti.kernel
+    @kernel
     def measure_penetration(self) -> float:
         """Largest depth [mm] of a point of the surface in a shape, 0 without penetration."""
         self.penetration[None] = 0.0

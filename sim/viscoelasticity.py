@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
-from sim.fields import field_of, fill_evenly
+from sim.fields import field_of, fill_evenly, zeros
 
 # Components of a symmetric tensor: 11, 22, 33, 12, 13, 23.
 COMPONENTS = 6
@@ -25,7 +25,6 @@ class PronyTerm:
     time_s: float
 
 
-@ti.data_oriented
 class Relaxation:
     """Stress history of ``count`` elements, of stresses relative to each element's stiffness.
 
@@ -40,10 +39,10 @@ class Relaxation:
             field_of(np.array(values, float))
             for values in ([t.modulus_ratio for t in terms], [t.time_s for t in terms])
         )
-        self.elastic = ti.Vector.field(COMPONENTS, ti.f32, count)
-        self.overstress = ti.Vector.field(COMPONENTS, ti.f32, (count, self.terms))
-        self.history = ti.Vector.field(COMPONENTS, ti.f32, count + 1)
-        self.factor = ti.field(ti.f32, ())
+        self.elastic = zeros(count, COMPONENTS, within=1)
+        self.overstress = zeros(count, self.terms, COMPONENTS, within=1)
+        self.history = zeros(count + 1, COMPONENTS, within=1)
+        self.factor = zeros()
         self.state = dict(elastic_stress=self.elastic, overstress=self.overstress)
         self.reset()
 

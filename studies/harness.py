@@ -1,11 +1,11 @@
 """What the studies share: a rehearsal built with a setup, and what is measured of it."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import psutil
-import taichi as ti
 from scipy.spatial.transform import Rotation
 
 from rehearsal.configuration import Setup, scene_of
@@ -13,7 +13,7 @@ from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
 from sim.device import start
-from sim.fields import array_of
+from sim.fields import Field, array_of
 from sim.solver import Solver
 
 
@@ -41,19 +41,13 @@ def _bytes_in(owner: Any, seen: set[int]) -> int:
     if id(owner) in seen:
         return 0
     seen.add(id(owner))
-    if isinstance(owner, ti.Field):
-        return int(np.prod(owner.shape, dtype=np.int64)) * 4 * _entries(owner)
+    if isinstance(owner, Field):
+        return 4 * math.prod((*owner.shape, *owner.element))
     if isinstance(owner, list | tuple):
         return sum(_bytes_in(part, seen) for part in owner)
     if type(owner).__module__.startswith(("sim.", "ultrasound.")):
         return sum(_bytes_in(part, seen) for part in vars(owner).values())
     return 0
-
-
-def _entries(field: ti.Field) -> int:
-    if isinstance(field, ti.StructField):
-        return sum(_entries(field.get_member_field(name)) for name in field.keys)
-    return getattr(field, "n", 1) * getattr(field, "m", 1)
 
 
 def positions_of(solver: Solver) -> np.ndarray:

@@ -15,7 +15,6 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 import numpy as np
 import pytest
-import taichi as ti
 import trimesh
 
 from rehearsal import worker_processes
@@ -48,18 +47,14 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture
 def device():
-    """Taichi on the CPU, with nothing left of an earlier test."""
+    """Taichi on the CPU. It stays for the next test, with its compiled kernels."""
     start("cpu")
-    yield
-    ti.reset()
 
 
 @pytest.fixture(scope="module")
 def one_device():
-    """Taichi on the CPU, for all tests of a file that keep nothing on it."""
+    """``device`` for fixtures of a file."""
     start("cpu")
-    yield
-    ti.reset()
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +91,6 @@ def nothing_built() -> Iterator[None]:
     worker_processes._built.clear()
     yield
     worker_processes._built.clear()
-    ti.reset()
 
 
 @pytest.fixture(scope="module")

@@ -3,20 +3,21 @@
 import numpy as np
 import taichi as ti
 
+from sim.kernels import kernel
 from ultrasound.sampled_volume import LANES
 from ultrasound.scanner import Scanner
 
 # Kernels of this module are compiled once for each scanner, those of a function at each call.
 
 
-@ti.kernel
+@kernel
 def _mask(scanner: ti.template(), inside: ti.types.ndarray(ti.i32, ndim=2)):
     for row, column in ti.ndrange(scanner.plane.pixels, scanner.plane.pixels):
         rest = scanner.plane.rest_at(row, column, scanner.plane.grid[0], scanner.plane.grid[1])
         inside[row, column] = scanner.in_organ(row, column, rest)
 
 
-@ti.kernel
+@kernel
 def _hounsfield(scanner: ti.template(), values: ti.types.ndarray(ti.f32, ndim=2)):
     for row, packet in ti.ndrange(scanner.plane.pixels, values.shape[1] // LANES):
         along, down = scanner.plane.grid[0], scanner.plane.grid[1]

@@ -10,7 +10,8 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.device import TASK
-from sim.fields import fill
+from sim.fields import fill, zeros
+from sim.kernels import kernel
 from ultrasound.probe import Probe
 from ultrasound.pulse import DB_OF_NEPER, PATH_ENTRIES, PATH_STEP
 
@@ -22,7 +23,6 @@ MOST_FOCUSED = 3.0
 FINER = 4
 
 
-@ti.data_oriented
 class ApertureRays:
     """Rays through the tissue of a ``Propagation``, each (RAYS, scanlines, samples), at their ends on the scanlines.
 
@@ -32,14 +32,14 @@ class ApertureRays:
     def __init__(self, sound: Any) -> None:
         self.sound = sound
         shape = RAYS, sound.lines, sound.most
-        self.amplitude, self.path = (ti.field(ti.f32, shape) for _ in range(2))
-        self.refraction = ti.Vector.field(2, ti.f32, shape)
+        self.amplitude, self.path = (zeros(*shape) for _ in range(2))
+        self.refraction = zeros(*shape, 2, within=1)
         # How many scanlines a ray is from its end at a sample, where it leaves the face. It goes from scanline to scanline: mixing
         # two would spread shadows.
-        self.offset = ti.field(ti.i32, (RAYS, sound.most))
+        self.offset = zeros(RAYS, sound.most, kind=ti.i32)
         # Scanlines per mm; half of the Fresnel zone in scanlines.
-        self.lines_per_mm, self.zone = ti.field(ti.f32, sound.most), ti.field(ti.i32, sound.most)
-        self.one_way = ti.field(ti.f32, FINER * PATH_ENTRIES)
+        self.lines_per_mm, self.zone = zeros(sound.most), zeros(sound.most, kind=ti.i32)
+        self.one_way = zeros(FINER * PATH_ENTRIES)
 
     def set_probe(self, probe: Probe, depth_mm: np.ndarray) -> None:
         """Update the tables of a probe's settings, at the depths of the samples."""
@@ -52,7 +52,7 @@ class ApertureRays:
             (self.one_way, 10 ** (decibel / 40)),
         )
 
-    @ti.kernel
+    @kernel
     def follow(self, count: int):
         """Follow each ray to the samples of all scanlines: amplitude, one way, and attenuation of its path [Np/MHz]."""
         for n in range(RAYS * TASK):
@@ -81,7 +81,7 @@ class ApertureRays:
             turned, refraction.y + turned * step_mm * self.lines_per_mm[k]
         )
 
-    @ti.kernel
+    @kernel
     def combine(self, count: int):
         """Write amplitude and path of the round trip: the mean over the rays that start on the array, squared."""
         for line, k in ti.ndrange(self.sound.lines, count):

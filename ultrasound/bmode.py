@@ -15,7 +15,8 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.device import TASK
-from sim.fields import array_of, fill
+from sim.fields import array_of, fill, zeros
+from sim.kernels import kernel
 from ultrasound.beam import elevation_profiles, profile_depths
 from ultrasound.lateral_kernel import (
     CLASSES,
@@ -76,7 +77,6 @@ class Wavefront:
         return float(np.degrees(np.arccos(np.clip((normal * along).sum(axis=1), -1, 1)).max()))
 
 
-@ti.data_oriented
 class BMode:
     """B-mode images of the image plane that sound propagates through, for probes with the same numbers of scanlines and samples."""
 
@@ -87,29 +87,29 @@ class BMode:
         most, packets, self.groups = self.sound.most, self.samples // LANES, -(-self.lines // GROUP)
         # Scattered signal, with room for the taps that lengthen it; and the signal of the scanlines.
         padded = self.lines, self.samples + 2 * LENGTH_TAPS
-        self.scattered_real, self.scattered_imaginary = (ti.field(ti.f32, padded) for _ in range(2))
-        self.real, self.imaginary, self.decibel = (ti.field(ti.f32, shape) for _ in range(3))
+        self.scattered_real, self.scattered_imaginary = (zeros(*padded) for _ in range(2))
+        self.real, self.imaginary, self.decibel = (zeros(*shape) for _ in range(3))
         # Signal after the spread, where it is asked for.
-        self.iq = ti.Vector.field(2, ti.f32, shape)
-        self.level = ti.field(ti.f32, (self.lines, most))
-        self.energy = ti.field(ti.f32, (self.groups, most))
+        self.iq = zeros(*shape, 2, within=1)
+        self.level = zeros(self.lines, most)
+        self.energy = zeros(self.groups, most)
         # Energy that side lobes receive, and what they would receive if it were 1 everywhere.
-        self.clutter = ti.Vector.field(2, ti.f32, (self.groups, most))
-        self.clutter_weight = ti.field(ti.f32, (most, 2 * self.groups - 1))
+        self.clutter = zeros(self.groups, most, 2, within=1)
+        self.clutter_weight = zeros(most, 2 * self.groups - 1)
         # Lengths of the noise across the plane (``elevation_levels``); lengths along the beam by the path.
-        self.elevation = ti.Vector.field(4, ti.f32, most)
-        self.axial_sd, self.speckle_sd = (ti.field(ti.f32, PATH_ENTRIES) for _ in range(2))
-        self.length_weight = ti.field(ti.f32, (LENGTHS, 2 * LENGTH_TAPS + 1))
-        self.weight = ti.field(ti.f32, (CLASSES, packets, 2 * MAX_HALF_WIDTH + 1))
-        self.half = ti.field(ti.i32, (CLASSES, packets))
+        self.elevation = zeros(most, 4, within=1)
+        self.axial_sd, self.speckle_sd = (zeros(PATH_ENTRIES) for _ in range(2))
+        self.length_weight = zeros(LENGTHS, 2 * LENGTH_TAPS + 1)
+        self.weight = zeros(CLASSES, packets, 2 * MAX_HALF_WIDTH + 1)
+        self.half = zeros(CLASSES, packets, kind=ti.i32)
         # Factor that restores unit mean square of speckle after the spread.
-        self.speckle_gain = ti.field(ti.f32, (CLASSES, packets))
-        self.scanline_class, self.side = ti.field(ti.i32, self.lines), ti.field(ti.i32, self.lines)
-        self.gain = ti.field(ti.f32, self.samples)
-        self.ringing = ti.field(ti.f32, (2, self.samples))
+        self.speckle_gain = zeros(CLASSES, packets)
+        self.scanline_class, self.side = zeros(self.lines, kind=ti.i32), zeros(self.lines, kind=ti.i32)
+        self.gain = zeros(self.samples)
+        self.ringing = zeros(2, self.samples)
         # Grey value at even steps of the dynamic range.
-        self.grey = ti.field(ti.f32, GREY_STEPS + 1)
-        self.source = ti.Vector.field(2, ti.f32, (self.plane.pixels, self.plane.pixels))
+        self.grey = zeros(GREY_STEPS + 1)
+        self.source = zeros(self.plane.pixels, self.plane.pixels, 2, within=1)
         self._table_settings: tuple | None = None
         # Whether the scanlines reach a pixel (rows, columns).
         self.covered = np.zeros(self.plane.shape, bool)
@@ -160,7 +160,7 @@ class BMode:
         self.spread(10.0 ** (probe.noise_before_gain_db / 20.0), self.plane.noise_key, True)
         return array_of(self.iq) @ np.array([1, 1j], np.complex64), rest
 
-    @ti.kernel
+    @kernel
     def _turn(
         self,
         stride: int,
@@ -232,7 +232,7 @@ class BMode:
             (self.source, source),
         )
 
-    @ti.kernel
+    @kernel
     def _set_levels(self, has_clutter: ti.template(), count: int):
         """Set the level of scattering at each tissue sample, with the clutter."""
         for line, k in ti.ndrange(self.lines, count):
@@ -259,7 +259,7 @@ class BMode:
                 clutter = tm.mix(self.clutter[group, k], self.clutter[group + 1, k], at - group)
                 self.level[line, k] = ti.sqrt((self.level[line, k] ** 2 + clutter.x) / (1.0 + clutter.y))
 
-    @ti.kernel
+    @kernel
     def _scatter_evenly(self, stride: ti.template()):
         """Write the level itself, without speckle."""
         for line, k in ti.ndrange(self.lines, self.samples // stride):
@@ -267,7 +267,7 @@ class BMode:
                 level = tm.mix(self.level[line, k], self.level[line, k + 1], (j + 0.5) / stride)
                 self.real[line, stride * k + j] = level
 
-    @ti.kernel
+    @kernel
     def _scatter(self, stride: ti.template(), speckle_sd: float, look: int):
         """Write the signal of scatterers: noise of the rest position, times the level."""
         for line, k in ti.ndrange(self.lines, self.samples // stride):
@@ -289,7 +289,7 @@ class BMode:
                         self.scattered_real[line, i] = self.scattered_real[line, i] + noise.x
                         self.scattered_imaginary[line, i] = self.scattered_imaginary[line, i] + noise.y
 
-    @ti.kernel
+    @kernel
     def _lengthen(self, stride: ti.template(), speckle_sd: float, sample_mm: float):
         """Lengthen the pulse as attenuation on the path has done, and scale speckle for the spread that follows."""
         for packet, line in ti.ndrange(self.samples // LANES, self.lines):
@@ -315,7 +315,7 @@ class BMode:
                 self.real[line, first + i] = gain * real[i] + rings
                 self.imaginary[line, first + i] = gain * imaginary[i]
 
-    @ti.kernel
+    @kernel
     def _reflect(
         self,
         has_speckle: ti.template(),
@@ -390,13 +390,13 @@ class BMode:
                 speckle += weight * self.speckle.at(matrix @ rest, key)
         return speckle
 
-    @ti.kernel
+    @kernel
     def _add(self):
-        for line, sample in self.decibel:
+        for line, sample in ti.ndrange(self.lines, self.samples):
             envelope = ti.abs(self.real[line, sample])
             self.decibel[line, sample] = DB_OF_NEPER * ti.log(envelope + SILENCE) + self.gain[sample]
 
-    @ti.kernel
+    @kernel
     def spread(self, noise: float, key: int, keeps: ti.template()):
         """Spread the scanlines as the beam is wide, add electronic noise, and take the envelope in dB; keep the signal or not."""
         # Scanline by scanline at one depth: the samples that neighbours share stay in the L1 cache.
@@ -446,24 +446,29 @@ class BMode:
         """Return LANES entries of a row of a field."""
         return Packet([field[row, first + i] for i in ti.static(range(LANES))])
 
-    @ti.kernel
+    @kernel
     def _scan_convert(self, dynamic_range_db: float, image: ti.types.ndarray(ti.u8, ndim=2)):
-        for row, column in self.source:
-            # A range known only now would cost a division for each pixel.
-            if row >= image.shape[0] or column >= image.shape[1]:
-                continue
-            at = self.source[row, column]
-            grey = 0.0
-            if at.x >= -0.5:
-                x, y = tm.clamp(at.x, 0.0, self.lines - 1.001), tm.clamp(at.y, 0.0, self.samples - 1.001)
-                line, sample = ti.cast(x, ti.i32), ti.cast(y, ti.i32)
-                along = y - sample
-                low = tm.mix(self.decibel[line, sample], self.decibel[line, sample + 1], along)
-                high = tm.mix(self.decibel[line + 1, sample], self.decibel[line + 1, sample + 1], along)
-                share = tm.clamp(tm.mix(low, high, x - line) / dynamic_range_db + 1.0, 0.0, 1.0)
-                step = ti.min(ti.cast(share * GREY_STEPS, ti.i32), GREY_STEPS - 1)
-                grey = tm.mix(self.grey[step], self.grey[step + 1], share * GREY_STEPS - step)
-            image[row, column] = ti.cast(grey + 0.5, ti.u8)
+        columns = image.shape[1]
+        # The index of a row costs a division: one for several pixels.
+        for row, packet in ti.ndrange(image.shape[0], (columns + LANES - 1) // LANES):
+            for column in range(packet * LANES, ti.min((packet + 1) * LANES, columns)):
+                grey = self.grey_at(self.source[row, column], dynamic_range_db)
+                image[row, column] = ti.cast(grey + 0.5, ti.u8)
+
+    @ti.func
+    def grey_at(self, at, dynamic_range_db):
+        """Return the grey value at a fractional scanline and sample; 0 outside the image."""
+        grey = 0.0
+        if at.x >= -0.5:
+            x, y = tm.clamp(at.x, 0.0, self.lines - 1.001), tm.clamp(at.y, 0.0, self.samples - 1.001)
+            line, sample = ti.cast(x, ti.i32), ti.cast(y, ti.i32)
+            along = y - sample
+            low = tm.mix(self.decibel[line, sample], self.decibel[line, sample + 1], along)
+            high = tm.mix(self.decibel[line + 1, sample], self.decibel[line + 1, sample + 1], along)
+            share = tm.clamp(tm.mix(low, high, x - line) / dynamic_range_db + 1.0, 0.0, 1.0)
+            step = ti.min(ti.cast(share * GREY_STEPS, ti.i32), GREY_STEPS - 1)
+            grey = tm.mix(self.grey[step], self.grey[step + 1], share * GREY_STEPS - step)
+        return grey
 
 
 def source_of_pixels(probe: Probe, rows: int, columns: int) -> np.ndarray:

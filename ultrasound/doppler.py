@@ -11,7 +11,8 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from sim.fields import array_of, fill
+from sim.fields import array_of, fill, zeros
+from sim.kernels import kernel
 from ultrasound.acoustics import CORTEX_DB, tissue_table
 from ultrasound.blood_flow import pulse_share
 from ultrasound.bmode import BMode, padded_source
@@ -60,7 +61,6 @@ def scale_colours(mode: DopplerMode) -> np.ndarray:
     return np.concatenate([colour_table(top)[::-1], *below]).astype(np.uint8)
 
 
-@ti.data_oriented
 class Doppler:
     """Doppler images of the plane of a B-mode image, along the scanlines of ``sound``: its own or, where they are steered, others.
 
@@ -72,13 +72,13 @@ class Doppler:
     def __init__(self, sound: Propagation, bmode: BMode, flow: SampledVolume) -> None:
         self.sound, self.bmode, self.flow = sound, bmode, flow
         self.lines, most = sound.lines, sound.most
-        self.moment, self.mean = (ti.Vector.field(3, ti.f32, (self.lines, most)) for _ in range(2))
+        self.moment, self.mean = (zeros(self.lines, most, 3, within=1) for _ in range(2))
         # Energy that a scanline receives from its neighbours.
-        self.weight = ti.field(ti.f32, (most, 2 * MAX_HALF_WIDTH + 1))
-        self.half = ti.field(ti.i32, most)
+        self.weight = zeros(most, 2 * MAX_HALF_WIDTH + 1)
+        self.half = zeros(most, kind=ti.i32)
         # Scanline and sample of each pixel.
-        self.source = ti.Vector.field(2, ti.f32, bmode.source.shape)
-        self.colour = ti.Vector.field(3, ti.f32, (2, STEPS + 1))
+        self.source = zeros(*bmode.source.shape, 2, within=1)
+        self.colour = zeros(2, STEPS + 1, 3, within=1)
         self._table_settings: tuple | None = None
 
     def render(
@@ -155,7 +155,7 @@ class Doppler:
         if self.sound is not self.bmode.sound:
             self.sound.set_probe(probe, array_of(self.bmode.sound.slice_sd))
 
-    @ti.kernel
+    @kernel
     def _find_flow(self, count: int, clamped: int, systole: float, limit: float, wall: float):
         """Set ``moment`` at each tissue sample: that of moving blood, behind the wall filter, and what is left of tissue."""
         for line, k in ti.ndrange(self.lines, count):
@@ -191,7 +191,7 @@ class Doppler:
         along = turned.x * direction.x + turned.y * direction.y
         return -along * size / ti.max(turned.norm(), 1e-9)
 
-    @ti.kernel
+    @kernel
     def _average(self, count: int, gate: int, noise: float, scatter: float, key: int):
         for line, k in ti.ndrange(self.lines, count):
             total, half = tm.vec3(0.0), self.half[k]
@@ -218,7 +218,7 @@ class Doppler:
         near, far = self.bmode.speckle.entry(i, j, along), self.bmode.speckle.entry(i, j, along + 1)
         return tm.mix(near, far, at - first)
 
-    @ti.kernel
+    @kernel
     def _paint(
         self,
         power: ti.template(),
@@ -228,25 +228,25 @@ class Doppler:
         grey: ti.types.ndarray(ti.u8, ndim=2),
         image: ti.types.ndarray(ti.u8, ndim=3),
     ):
-        for row, column in self.source:
-            # A range known only now would cost a division for each pixel.
-            if row >= grey.shape[0] or column >= grey.shape[1]:
-                continue
-            colour = tm.vec3(ti.cast(grey[row, column], ti.f32))
-            at = self.source[row, column]
-            if at.x >= -0.5 and colour.x < PRIORITY * 255.0:
-                mean = self.mean_at(at.x, (at.y + 0.5) * per_stride)
-                if mean.z > threshold:
-                    share = ti.atan2(mean.y, mean.x) / tm.pi
-                    if ti.abs(share) > least_share:
-                        scale = ti.cast(share < 0.0, ti.i32)
-                        if ti.static(power):
-                            above_db = 0.5 * DB_OF_NEPER * ti.log(mean.z / threshold)
-                            share, scale = above_db / POWER_RANGE_DB, 0
-                        step = ti.round(tm.clamp(ti.abs(share), 0.0, 1.0) * STEPS, ti.i32)
-                        colour = self.colour[scale, step]
-            for k in ti.static(range(3)):
-                image[row, column, k] = ti.cast(colour[k] + 0.5, ti.u8)
+        columns = grey.shape[1]
+        # The index of a row costs a division: one for several pixels.
+        for row, packet in ti.ndrange(grey.shape[0], (columns + LANES - 1) // LANES):
+            for column in range(packet * LANES, ti.min((packet + 1) * LANES, columns)):
+                colour = tm.vec3(ti.cast(grey[row, column], ti.f32))
+                at = self.source[row, column]
+                if at.x >= -0.5 and colour.x < PRIORITY * 255.0:
+                    mean = self.mean_at(at.x, (at.y + 0.5) * per_stride)
+                    if mean.z > threshold:
+                        share = ti.atan2(mean.y, mean.x) / tm.pi
+                        if ti.abs(share) > least_share:
+                            scale = ti.cast(share < 0.0, ti.i32)
+                            if ti.static(power):
+                                above_db = 0.5 * DB_OF_NEPER * ti.log(mean.z / threshold)
+                                share, scale = above_db / POWER_RANGE_DB, 0
+                            step = ti.round(tm.clamp(ti.abs(share), 0.0, 1.0) * STEPS, ti.i32)
+                            colour = self.colour[scale, step]
+                for k in ti.static(range(3)):
+                    image[row, column, k] = ti.cast(colour[k] + 0.5, ti.u8)
 
     @ti.func
     def mean_at(self, line, k):

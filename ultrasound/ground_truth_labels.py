@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 
 from sim.fields import field_of
+from sim.kernels import kernel
 from ultrasound.plane_in_tissue import PlaneInTissue
 from ultrasound.sampled_volume import SampledVolume
 from ultrasound.sweep import PixelLabel
@@ -13,7 +14,6 @@ from ultrasound.sweep import PixelLabel
 MAX_BEADS = 255 // PixelLabel.BEAD
 
 
-@ti.data_oriented
 class GroundTruthLabels:
     """``PixelLabel`` values of the plane located last, by the rest position of its tissue.
 
@@ -32,7 +32,7 @@ class GroundTruthLabels:
         self.plane, self.organ, self.radius_mm = plane, organ, radius_mm
         self.tumour: Any = tumour
         self.has_tumour = tumour is not None
-        self.beads = 0 if beads is None else len(beads)
+        self.beads, self.has_beads = 0 if beads is None else len(beads), beads is not None
         if self.beads > MAX_BEADS:
             raise ValueError(f"{self.beads} beads: at most {MAX_BEADS} fit into 8-bit labels")
         if beads is not None:
@@ -44,7 +44,7 @@ class GroundTruthLabels:
         self._render(image)
         return image
 
-    @ti.kernel
+    @kernel
     def _render(self, image: ti.types.ndarray(ti.u8, ndim=2)):
         for row, column in ti.ndrange(image.shape[0], image.shape[1]):
             rest = self.plane.rest_at(row, column, self.plane.grid[0], self.plane.grid[1])
@@ -55,7 +55,7 @@ class GroundTruthLabels:
                 if ti.static(self.has_tumour):
                     if self.tumour.sample(rest) < 0.0:
                         label = PixelLabel.TUMOUR
-                if ti.static(self.beads > 0):
+                if ti.static(self.has_beads):
                     for k in range(self.beads):
                         if (rest - self.bead[k]).norm_sqr() < self.radius_mm**2:
                             label = label % PixelLabel.BEAD + PixelLabel.BEAD * (k + 1)

@@ -7,12 +7,12 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.embedding import Embedding, Unmoved
-from sim.fields import array_of, fill
+from sim.fields import array_of, fill, zeros
+from sim.kernels import kernel
 from ultrasound.probe_manipulator import ImagePlane
 from ultrasound.sampled_volume import LANES, Lanes
 
 
-@ti.data_oriented
 class PlaneInTissue:
     """The tetrahedron of an embedding that contains each pixel of an image plane, which has at most ``pixels`` x ``pixels``.
 
@@ -24,9 +24,9 @@ class PlaneInTissue:
         self.embedding = embedding
         self.pixels = pixels
         self.shape = pixels, pixels
-        self.owner = ti.field(ti.i32, (pixels, pixels))
-        self.grid = ti.Vector.field(2, ti.f32, 2)
-        self._last = ti.Vector.field(2, ti.i32, ())
+        self.owner = zeros(pixels, pixels, kind=ti.i32)
+        self.grid = zeros(2, 2, within=1)
+        self._last = zeros(2, within=1, kind=ti.i32)
         # Size of a pixel and centre of the first one, of an image of all pixels.
         self._whole = np.zeros((2, 2))
         self._rest_grids: dict[int, np.ndarray] = {}
@@ -65,7 +65,7 @@ class PlaneInTissue:
             self._rest_grid(tm.vec2(*pixel), tm.vec2(*first), self._rest_grids[count])
         return self._rest_grids[count]
 
-    @ti.kernel
+    @kernel
     def _rest_grid(self, pixel_mm: tm.vec2, first_mm: tm.vec2, places: ti.types.ndarray(ti.f32, ndim=3)):
         for i, j in ti.ndrange(places.shape[0], places.shape[1]):
             row = (i * (self.pixels - 1)) // (places.shape[0] - 1)

@@ -12,7 +12,8 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.device import TASK
-from sim.fields import array_of, fill
+from sim.fields import array_of, fill, zeros
+from sim.kernels import kernel
 from ultrasound.acoustics import MAST_OFFSET, MAST_SLOPE, acoustic_values
 from ultrasound.aperture_rays import ApertureRays
 from ultrasound.beam import half_apertures_mm
@@ -53,7 +54,6 @@ class TissueSample:
     linear: ti.types.matrix(3, 4, ti.f32)
 
 
-@ti.data_oriented
 class Propagation:
     """Sound along the scanlines of a probe, at tissue samples ``stride_of`` scanline samples apart.
 
@@ -92,19 +92,19 @@ class Propagation:
         self.lines, samples = probe.number_of_scanlines, probe.number_of_samples_per_scanline
         self.most = samples // STRIDES[1] + 1
         shape = self.lines, self.most
-        self.start, self.direction, self.element = (ti.Vector.field(2, ti.f32, self.lines) for _ in range(3))
-        self.contact = ti.field(ti.f32, self.lines)
-        self.tissue, self.rest, self.across = (ti.Vector.field(3, ti.f32, shape) for _ in range(3))
-        self.echo, self.capsule = (ti.Vector.field(4, ti.f32, shape) for _ in range(2))
-        self.depth, self.passed, self.amplitude, self.path = (ti.field(ti.f32, shape) for _ in range(4))
+        self.start, self.direction, self.element = (zeros(self.lines, 2, within=1) for _ in range(3))
+        self.contact = zeros(self.lines)
+        self.tissue, self.rest, self.across = (zeros(*shape, 3, within=1) for _ in range(3))
+        self.echo, self.capsule = (zeros(*shape, 4, within=1) for _ in range(2))
+        self.depth, self.passed, self.amplitude, self.path = (zeros(*shape) for _ in range(4))
         # Turned by refraction at a sample [rad].
-        self.turn = ti.field(ti.f32, shape)
+        self.turn = zeros(*shape)
         # Half angle of the aperture [rad], SD of the beam across the image plane [mm] and amplitude of harmonics, at each sample.
-        self.aperture_angle, self.slice_sd, self.build_up = (ti.field(ti.f32, self.most) for _ in range(3))
-        self.speckle_db, self.echo_db = (ti.field(ti.f32, PATH_ENTRIES) for _ in range(2))
+        self.aperture_angle, self.slice_sd, self.build_up = (zeros(self.most) for _ in range(3))
+        self.speckle_db, self.echo_db = (zeros(PATH_ENTRIES) for _ in range(2))
         # Half angle of the aperture across the plane [rad]; of interfaces: amplitudes reflected as a mirror and diffusely, slope,
         # amplitudes scattered evenly by soft and by hard ones.
-        self.reflection = ti.field(ti.f32, 6)
+        self.reflection = zeros(6)
         self.rays = ApertureRays(self)
 
     def stride_of(self, probe: Probe) -> int:
@@ -157,10 +157,10 @@ class Propagation:
         self.rays.follow(count)
         self.rays.combine(count)
 
-    @ti.kernel
+    @kernel
     def _find_contact(self):
         """Set for each element of the array whether it is in contact."""
-        for i in self.element:
+        for i in range(self.lines):
             place = self.element[i]
             if ti.static(not self.by_organ):
                 place.y += 0.5 * self.gap_mm
@@ -173,7 +173,7 @@ class Propagation:
                 near = self.tissue_volume.sample(rest)[0] > 1.0
             self.contact[i] = ti.cast(near, ti.f32)
 
-    @ti.kernel
+    @kernel
     def _sample(self, thick: ti.template(), count: int, step_mm: float):
         for n in range(self.lines * TASK):
             if n % TASK == 0:
@@ -270,7 +270,7 @@ class Propagation:
                 found = tm.vec4(self.around, 0.0, 0.0, 0.0)
         return TissueSample(found, rest, linear)  # type: ignore[call-arg]
 
-    @ti.kernel
+    @kernel
     def _find_interfaces(self, count: int, step_mm: float):
         """Write ``echo`` and ``passed``, the amplitude that goes on at each sample, one way."""
         for n in range(self.lines * TASK):

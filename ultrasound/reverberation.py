@@ -10,6 +10,8 @@ import numpy as np
 import taichi as ti
 
 from sim.device import TASK
+from sim.fields import zeros
+from sim.kernels import kernel
 from ultrasound.probe import Probe
 from ultrasound.propagation import Propagation, speed_ratio
 from ultrasound.pulse import DB_OF_NEPER
@@ -34,15 +36,14 @@ FALL, MORE_IN_AIR_DB = 1.5, 6.0
 FALL_IN_AIR, LENS, BANDS = 9.4, 5.3, 0.27
 
 
-@ti.data_oriented
 class Reverberation:
     """Amplitude of scatter ``level`` (scanlines, samples) that reverberation adds at each tissue sample of ``sound``."""
 
     def __init__(self, sound: Propagation) -> None:
         self.sound = sound
-        self.level = ti.field(ti.f32, (sound.lines, sound.most))
+        self.level = zeros(sound.lines, sound.most)
 
-    @ti.kernel
+    @kernel
     def run(self, count: int, step_mm: float):
         """Set ``level`` after ``sound`` ran."""
         for n in range(self.sound.lines * TASK):

@@ -15,7 +15,6 @@ Lanes = ti.types.vector(LANES, ti.f32)
 FAR_MM = 1e6
 
 
-@ti.data_oriented
 class SampledVolume:
     """Voxels (nx, ny, nz) float32 with the affine map (4, 4) that takes mm to voxel indices.
 
@@ -30,7 +29,7 @@ class SampledVolume:
         self.shape, self.count = voxels.shape[:3], filled.shape[:3]
         self.index_from_mm = index_from_mm
         self.outside = float(outside)
-        self.strides = self.count[1] * self.count[2], self.count[2]
+        self.next_x, self.next_y = self.count[1] * self.count[2], self.count[2]
         flat = filled.reshape(-1, *voxels.shape[3:])
         self.voxels = field_of(flat, voxels.ndim - 3)
         self.linear = ti.Matrix(index_from_mm[:3, :3].tolist())
@@ -64,7 +63,7 @@ class SampledVolume:
         clamped = tm.clamp(at, 0.0, last)
         most = ti.Vector([self.count[0] - 2, self.count[1] - 2, self.count[2] - 2])
         base = ti.min(ti.cast(clamped, ti.i32), most)
-        return base.x * self.strides[0] + base.y * self.strides[1] + base.z, clamped - base, inside
+        return base.x * self.next_x + base.y * self.next_y + base.z, clamped - base, inside
 
     @ti.func
     def sample(self, p):
@@ -72,7 +71,7 @@ class SampledVolume:
         first, t, inside = self.cell_at(p)
         value = self.voxels[0] * 0.0 + self.outside
         if inside:
-            x, y = ti.static(self.strides)
+            x, y = self.next_x, self.next_y
             low = tm.mix(self.along_z(first, t.z), self.along_z(first + y, t.z), t.y)
             high = tm.mix(self.along_z(first + x, t.z), self.along_z(first + x + y, t.z), t.y)
             value = tm.mix(low, high, t.x)
@@ -85,15 +84,15 @@ class SampledVolume:
         first_i, along_i, off_i = self.lanes_along(0, a[0, 0] * x + a[0, 1] * y + a[0, 2] * z + o[0])
         first_j, along_j, off_j = self.lanes_along(1, a[1, 0] * x + a[1, 1] * y + a[1, 2] * z + o[1])
         first_k, along_k, off_k = self.lanes_along(2, a[2, 0] * x + a[2, 1] * y + a[2, 2] * z + o[2])
-        first = first_i * self.strides[0] + first_j * self.strides[1] + first_k
+        first = first_i * self.next_x + first_j * self.next_y + first_k
         low, high = Lanes(0.0), Lanes(0.0)
         if in_line and first[0] == first[LANES - 1]:
             # An image has many pixels per voxel: where both ends are in one cell, all points between are.
-            low = self.between(first[0], 0, along_j, along_k)
-            high = self.between(first[0], self.strides[0], along_j, along_k)
+            low = self.between(first[0], along_j, along_k)
+            high = self.between(first[0] + self.next_x, along_j, along_k)
         else:
-            low = self.lanes_between(first, 0, along_j, along_k)
-            high = self.lanes_between(first, self.strides[0], along_j, along_k)
+            low = self.lanes_between(first, along_j, along_k)
+            high = self.lanes_between(first + self.next_x, along_j, along_k)
         value = low + along_i * (high - low)
         off = ti.max(ti.max(off_i, off_j), off_k)
         return ti.select(off <= 0.5, value, self.outside)
@@ -106,26 +105,25 @@ class SampledVolume:
         return base, clamped - base, ti.abs(at - clamped)
 
     @ti.func
-    def between(self, voxel, shift: ti.template(), tj, tk):
-        """Return values at lanes between the four voxels of a plane, the first of which is ``shift`` further."""
-        v, y = ti.static(self.voxels, shift + self.strides[1])
-        low = v[voxel + shift] + tk * (v[voxel + shift + 1] - v[voxel + shift])
-        high = v[voxel + y] + tk * (v[voxel + y + 1] - v[voxel + y])
-        return low + tj * (high - low)
-
-    @ti.func
-    def lanes_between(self, first, shift: ti.template(), tj, tk):
-        """As ``between``, each lane with its own voxels."""
-        y = ti.static(shift + self.strides[1])
-        a, b = self.lanes_of(first, shift), self.lanes_of(first, shift + 1)
-        c, d = self.lanes_of(first, y), self.lanes_of(first, y + 1)
+    def between(self, voxel, tj, tk):
+        """Return values at lanes between the four voxels of a plane, of which this is the first."""
+        a, b = self.voxels[voxel], self.voxels[voxel + 1]
+        c, d = self.voxels[voxel + self.next_y], self.voxels[voxel + self.next_y + 1]
         low, high = a + tk * (b - a), c + tk * (d - c)
         return low + tj * (high - low)
 
     @ti.func
-    def lanes_of(self, first, shift: ti.template()):
-        """Return the voxels ``shift`` after those of the lanes."""
-        return Lanes([self.voxels[first[lane] + shift] for lane in ti.static(range(LANES))])
+    def lanes_between(self, first, tj, tk):
+        """As ``between``, each lane with its own voxels."""
+        a, b = self.lanes_of(first), self.lanes_of(first + 1)
+        c, d = self.lanes_of(first + self.next_y), self.lanes_of(first + self.next_y + 1)
+        low, high = a + tk * (b - a), c + tk * (d - c)
+        return low + tj * (high - low)
+
+    @ti.func
+    def lanes_of(self, at):
+        """Return the voxels of the lanes."""
+        return Lanes([self.voxels[at[lane]] for lane in ti.static(range(LANES))])
 
     @ti.func
     def along_z(self, voxel, t):
@@ -157,9 +155,10 @@ class SampledVolume:
         first, t, inside = self.cell_at(p)
         along = tm.vec3(0.0)
         if inside:
-            x, y = ti.static(self.strides)
-            low = tm.vec4([self.voxels[first + i] for i in ti.static((0, y, x, x + y))])
-            high = tm.vec4([self.voxels[first + i + 1] for i in ti.static((0, y, x, x + y))])
+            low, high = tm.vec4(0.0), tm.vec4(0.0)
+            for k in ti.static(range(4)):
+                voxel = first + ti.static(k // 2) * self.next_x + ti.static(k % 2) * self.next_y
+                low[k], high[k] = self.voxels[voxel], self.voxels[voxel + 1]
             v = tm.mix(low, high, t.z)
             rise = high - low
             along = tm.vec3(
@@ -175,10 +174,11 @@ class SampledVolume:
         most = ti.Vector([self.count[0] - 2, self.count[1] - 2, self.count[2] - 2])
         base = ti.min(ti.cast(at, ti.i32), most)
         t = at - base
-        x, y = ti.static(self.strides)
-        first = base.x * x + base.y * y + base.z
-        low = tm.vec4([self.voxels[first + i][0] for i in ti.static((0, y, x, x + y))])
-        high = tm.vec4([self.voxels[first + i + 1][0] for i in ti.static((0, y, x, x + y))])
+        first = base.x * self.next_x + base.y * self.next_y + base.z
+        low, high = tm.vec4(0.0), tm.vec4(0.0)
+        for k in ti.static(range(4)):
+            voxel = first + ti.static(k // 2) * self.next_x + ti.static(k % 2) * self.next_y
+            low[k], high[k] = self.voxels[voxel][0], self.voxels[voxel + 1][0]
         ends = tm.mix(low, high, t.z)
         return tm.mix(tm.mix(ends.x, ends.y, t.y), tm.mix(ends.z, ends.w, t.y), t.x)
 

@@ -15,6 +15,7 @@ import trimesh
 from trimesh.intersections import mesh_plane
 
 from sim.embedding import Embedding, Unmoved
+from sim.kernels import kernel
 from ultrasound.acoustics import TissueVoxels, check_tissues, stored_properties
 from ultrasound.blood_flow import stored_flow
 from ultrasound.bmode import BMode, Wavefront
@@ -81,7 +82,6 @@ def start_acoustics(anatomy: ScannedAnatomy) -> Future[np.ndarray]:
     return values
 
 
-@ti.data_oriented
 class Scanner:
     """Images of at most ``pixels`` x ``pixels`` of an anatomy that an embedding deforms.
 
@@ -292,7 +292,7 @@ class Scanner:
         self._window(*self.plane.grid_mm, window_hu, level_hu, image)
         return image
 
-    @ti.kernel
+    @kernel
     def _window(
         self,
         pixel_mm: tm.vec2,

@@ -73,7 +73,6 @@ class LongAxis:
     share: tm.vec2
 
 
-@ti.data_oriented
 class Speckle:
     """The noise block on the device. Each block of space holds it, shifted by a hash of the block, so that it does not repeat.
 

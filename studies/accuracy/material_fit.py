@@ -194,7 +194,7 @@ def residuals_of(case: BeadCase, setup: Setup, values: dict[str, float]) -> np.n
     assert isinstance(model, NeoHookean)
     parts = [_with_young(part.material, values[f"{part.name} modulus"]) for part in case.parts]
     model.set_material(values["modulus"], values["Poisson's ratio"], parts)
-    model.contacts.coefficient[None] = values["friction"]
+    model.contacts.coefficient = values["friction"]
     run = experiment.run(setup.but(young_kpa=values["modulus"], poisson=values["Poisson's ratio"]))
     beads = (run.beads - case.measured).ravel() / BEAD_MM
     known = np.isfinite(case.probe_force_n).all(axis=1)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from sim.embedding import Unmoved
-from sim.fields import array_of, fill
+from sim.fields import array_of, fill, fill_evenly
 from ultrasound.blood_flow import BEAT_S, CHANNELS, SYSTOLE_S
 from ultrasound.bmode import BMode
 from ultrasound.doppler import Doppler
@@ -105,7 +105,7 @@ class EchoPhantom:
         place = spacing * (np.arange(self.probe.number_of_scanlines) - scanline)
         echo = np.exp(-0.5 * (place / self.probe.speckle_sd_mm) ** 2)
         fill((self.bmode.real, np.repeat(echo[:, None], len(self.depth_mm), axis=1)))
-        self.bmode.imaginary.fill(0.0)
+        fill_evenly(self.bmode.imaginary, 0.0)
         self.bmode.spread(0.0, 0, False)
         sample = int(depth_mm / self.probe.sample_mm)
         decibel = array_of(self.bmode.decibel).astype(float) - self.probe.gain_db()

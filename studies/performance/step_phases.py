@@ -8,6 +8,7 @@ import taichi.math as tm
 
 from errors import UserError
 from rehearsal.stopwatch import timed
+from sim.kernels import kernel
 from sim.shape_matching import ShapeMatching
 from sim.solver import Solver, StepSettings, relaxation_at
 
@@ -21,7 +22,6 @@ AFTER = ("scatter", "keep out", "velocities")
 CONTACTS = ("find contacts", "leave contacts", "contacts", "keep out")
 
 
-@ti.data_oriented
 class Phases:
     """A solver whose steps are taken piece by piece, with the same settings each.
 
@@ -69,7 +69,7 @@ class Phases:
         self.ms[name] += taken[0]
         self.calls[name] += 1
 
-    @ti.kernel
+    @kernel
     def _piece(self, name: ti.template(), substep: int, factor: float):
         if ti.static(self.serial):
             ti.loop_config(serialize=True)

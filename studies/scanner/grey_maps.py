@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from sim.fields import fill
 from studies.echo.echo_phantom import EchoPhantom
 from studies.image_quality import grey_figures
 from studies.scanner.recorded_speckle import DEPTH_MM, HALF_SECTOR_DEG, RADIUS_MM
@@ -100,7 +101,7 @@ def our_picture(amplitude: np.ndarray, phantom: EchoPhantom) -> np.ndarray:
     phantom.amplitude(probe=probe)
     # White is what a hundredth of the samples exceed.
     decibel = 20 * np.log10(np.maximum(amplitude, 1e-9) / np.percentile(amplitude, 99))
-    phantom.bmode.decibel.from_numpy(decibel[:, : probe.number_of_samples_per_scanline].astype(np.float32))
+    fill((phantom.bmode.decibel, decibel[:, : probe.number_of_samples_per_scanline]))
     return phantom.bmode.scan_converted(probe)
 
 

@@ -90,7 +90,7 @@ def set_values(rehearsal: Rehearsal, values: Mapping[str, float]) -> None:
     if "capsule" in values:
         model.capsule.set_stiffness(values["capsule"])
     if "friction" in values:
-        rehearsal.contacts.coefficient[None] = values["friction"]
+        rehearsal.contacts.coefficient = values["friction"]
     if "pedicle" in values or "fat" in values:
         given = {"stiffness_n_mm": "pedicle", "fat_kpa_mm": "fat"}
         changed = {key: values[name] for key, name in given.items() if name in values}

@@ -5,7 +5,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import taichi as ti
 from conftest import rotation_about
 from plan_ball import SIZE, over_ball, plan_of, straight_pass, sweep_of
 
@@ -15,7 +14,7 @@ from render import scene_view, transducer_shape
 from render.keys import Keys, begin
 from render.scene_view import DONE, TO_GO, PlanLines
 from render.viewer import Controls, Guidance, Settings
-from sim.fields import array_of
+from sim.fields import Field, array_of
 from ultrasound.probe_manipulator import advanced
 from ultrasound.target import TARGETS
 
@@ -271,7 +270,7 @@ class Drawn:
 
     def lines(self, points, width, **colours) -> None:
         colours = {
-            name: array_of(each) if isinstance(each, ti.Field) else each for name, each in colours.items()
+            name: array_of(each) if isinstance(each, Field) else each for name, each in colours.items()
         }
         self.given.append((array_of(points).astype(float), colours))
 

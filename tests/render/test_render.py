@@ -25,7 +25,7 @@ from render.viewer import Controls, Geometry, Settings, View
 from render.warning_box import warning_image, warning_rect
 from render.window_layout import FULL_SIZE, RULER_WIDTH, WindowLayout
 from sim.device import start
-from sim.fields import fill
+from sim.fields import fill, fill_evenly, zeros
 
 BOUNDS = np.array([[-54.0, -33.0, -21.0], [54.0, 27.0, 21.0]])
 LAYOUT = WindowLayout(1280, 720)
@@ -245,7 +245,7 @@ def window(request):
     start("cpu")
     ball = trimesh.creation.icosphere(subdivisions=3, radius=ORGAN_MM)
     vertices = ball.vertices.astype(np.float32)
-    field = ti.Vector.field(3, ti.f32, shape=len(vertices))
+    field = zeros(len(vertices), 3, within=1)
     fill((field, vertices))
     geometry = Geometry((field, ball.faces.astype(np.int32)), np.array([[-45.0] * 3, [45.0] * 3]))
     try:
@@ -280,7 +280,7 @@ def test_picture_before_any_view_is_refused(window):
 
 def test_organ_is_drawn_where_the_camera_projects_it(window):
     opened, field, vertices = window
-    field.fill(0.0)
+    fill_evenly(field, 0.0)
     opened.draw(_far_view())
     empty = opened.picture()
     for shift in ([0.0, 0.0, 0.0], [18.0, 0.0, 0.0], [0.0, 0.0, 15.0]):
@@ -553,13 +553,14 @@ def test_the_cut_is_filled_and_the_half_before_it_removed(window):
 
 
 PROBE = """
-import numpy as np, taichi as ti
+import numpy as np
 from sim.device import start
+from sim.fields import zeros
 start("cpu")
 from render.software_scene import SoftwareScene
 from render.viewer import Geometry
 from render.window import NoVulkan, Window
-field = ti.Vector.field(3, ti.f32, shape=3)
+field = zeros(3, 3, within=1)
 try:
     Window(Geometry((field, np.array([[0, 1, 2]])), np.array([[-1.0] * 3, [1.0] * 3])), visible=False)
 except NoVulkan as reason:

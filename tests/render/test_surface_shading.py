@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import trimesh
 
-import sim.fields
 from render.surface_shading import CUT_EDGE_MM, GLASS, SOLID, TINT, ShadedSurface
 from sim.fields import array_of, field_of
 
@@ -45,12 +44,10 @@ def colours_of(mesh: trimesh.Trimesh, opacity: float, tinted: np.ndarray, is_cut
     return np.column_stack([base * (1.0 - 0.25 * rim)[:, None] + sheen[:, None], alpha])
 
 
-@pytest.mark.parametrize("on_cpu", [True, False], ids=["memory", "fields"])
 @pytest.mark.parametrize("opacity, is_cut", [(SOLID, False), (GLASS, False), (SOLID, True)])
-def test_a_surface_is_shaded_by_the_formulas(one_device, monkeypatch, on_cpu, opacity, is_cut):
+def test_a_surface_is_shaded_by_the_formulas(device, opacity, is_cut):
     mesh = bean()
     surface = ShadedSurface(field_of(mesh.vertices, 1), mesh.faces, BASE, GLOSS)
-    monkeypatch.setattr(sim.fields, "on_cpu", lambda: on_cpu)
     tinted = mesh.vertices[:, 0] > 3.0
     surface.tint(tinted)
     surface.shade(EYE, LIGHT, opacity, CUT if is_cut else None)

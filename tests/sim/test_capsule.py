@@ -9,7 +9,8 @@ from test_neo_hookean import begin, deformed
 
 from sim.body import Body
 from sim.capsule import N_MM, Capsule
-from sim.fields import array_of
+from sim.fields import array_of, zeros
+from sim.kernels import kernel
 from sim.lattice import fill_with_cells
 from sim.material import Material
 from sim.neo_hookean import ORGAN, NeoHookean
@@ -30,7 +31,7 @@ def energy_density(c11, c12, c22):
 
 def energy(capsule: Capsule, x: np.ndarray) -> float:
     """Energy [uN mm] at node positions x."""
-    node, gradient = array_of(capsule.node), array_of(capsule.gradient).astype(float)
+    node, gradient = array_of(capsule.node), array_of(capsule.gradient).reshape(-1, 8, 2).astype(float)
     f = np.einsum("pka,pkt->pat", x[node], gradient)
     c = np.einsum("pat,pas->pts", f, f)
     return float(array_of(capsule.weight).astype(float) @ energy_density(c[:, 0, 0], c[:, 0, 1], c[:, 1, 1]))
@@ -50,16 +51,16 @@ def with_capsule(
     )
 
 
-@ti.kernel
+@kernel
 def measure(capsule: ti.template(), force: ti.template(), stiffness: ti.template()):
-    for i in force:
+    for i in range(force.shape[0]):
         force[i], stiffness[i] = capsule.node_force(i)
 
 
 def forces_of(model: NeoHookean, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     put(model, x)
     begin(model, 1 / 60)
-    force, stiffness = ti.Vector.field(3, ti.f32, len(x)), ti.Matrix.field(3, 3, ti.f32, len(x))
+    force, stiffness = zeros(len(x), 3, within=1), zeros(len(x), 3, 3, within=2)
     measure(model.capsule, force, stiffness)
     return array_of(force).astype(float), array_of(stiffness).astype(float)
 

@@ -5,14 +5,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import taichi as ti
+from taichi.lang import impl
 from taichi.lang.impl import default_cfg
 
 import sim.device
 from sim.device import NoDevice, start
-from sim.fields import array_of, field_of
 
 
 def test_the_kernel_cache_has_space_for_many_patients(device, tmp_path):
@@ -103,11 +102,8 @@ def test_an_error_in_a_kernel_names_file_line_and_function(device):
         assert f"line {outer._primal.func.__code__.co_firstlineno + 4}, in outer:" in told
 
 
-def test_each_start_of_taichi_has_its_own_memory():
-    for count in (5, 5_000_000):
-        start("cpu")
-        field = field_of(np.arange(count))
-        assert np.array_equal(field.to_numpy(), np.arange(count)) and np.array_equal(
-            array_of(field), np.arange(count)
-        )
-        ti.reset()
+def test_a_second_start_keeps_what_is_compiled(device):
+    program = impl.get_runtime().prog
+    assert start("cpu") == "cpu" and impl.get_runtime().prog is program
+    start("cpu", kernel_profiler=True)
+    assert impl.get_runtime().prog is not program

@@ -20,7 +20,8 @@ from sim.divergence_check import (
     DivergenceCheck,
     tetrahedra_among,
 )
-from sim.fields import array_of, fill
+from sim.fields import Field, array_of, fill, zeros
+from sim.kernels import kernel
 from sim.shapes import (
     GRID_MM,
     IMPACT_DEPTH_MM,
@@ -197,31 +198,31 @@ def test_fast_bodies_do_not_pass_through_a_floor(kept, ball, model, velocity):
         assert position(solver)[:, 2].min() > -12.0 - 6.0
 
 
-@ti.kernel
+@kernel
 def fractions(
     impact: ti.template(), start: ti.template(), path: ti.template(), free: float, out: ti.template()
 ):
-    for i in start:
+    for i in range(start.shape[0]):
         out[i] = impact.fraction(start[i], path[i], free)
 
 
-@ti.kernel
+@kernel
 def clearances(shape: ti.template(), at: ti.template(), out: ti.template()):
-    for i in at:
+    for i in range(at.shape[0]):
         out[i] = shape.clearance(at[i])
 
 
-def field_of(values) -> ti.Field:
+def field_of(values) -> Field:
     values = np.atleast_2d(np.asarray(values, np.float32))
-    field = ti.Vector.field(3, ti.f32, len(values))
+    field = zeros(len(values), 3, within=1)
     fill((field, values))
     return field
 
 
 def share_of(shapes: list, start, way, free: float) -> float:
-    out = ti.field(ti.f32, 1)
+    out = zeros(1)
     fractions(TimeOfImpact(shapes), field_of(start), field_of(way), free, out)
-    return float(out[0])
+    return float(array_of(out)[0])
 
 
 def test_a_path_ends_at_the_time_of_impact(one_device):
@@ -253,7 +254,7 @@ def test_a_path_ends_at_the_first_of_several_shapes(one_device):
 def test_clearance_is_not_more_than_the_distance(one_device, ball):
     shape = SignedDistanceField.of_surface(ball.vertices, ball.faces, 4.0)
     points = np.random.default_rng(1).uniform(-40, 40, (2000, 3))
-    out = ti.field(ti.f32, len(points))
+    out = zeros(len(points))
     clearances(shape, field_of(points), out)
     true = np.linalg.norm(points, axis=1) - 12.0
     # Linear interpolation: an error of less than half the diagonal of a cell; outside the grid of half a cell at most.
@@ -268,7 +269,7 @@ def test_clearance_outside_a_grid_is_the_distance_to_it(one_device):
     shape = SignedDistanceField(np.linalg.norm(grid, axis=-1) - 12.0, np.full(3, -16.0), spacing)
     points = np.random.default_rng(2).uniform(-40, 40, (2000, 3))
     points = points[(np.abs(points) > 16.0).any(axis=1)]
-    out = ti.field(ti.f32, len(points))
+    out = zeros(len(points))
     clearances(shape, field_of(points), out)
     way = np.linalg.norm(points - np.clip(points, -16.0, 16.0), axis=1)
     # And a little more, so that paths end in the grid.

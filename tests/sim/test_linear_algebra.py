@@ -5,7 +5,8 @@ import pytest
 import taichi as ti
 from scipy.spatial.transform import Rotation
 
-from sim.fields import array_of, fill
+from sim.fields import array_of, fill, zeros
+from sim.kernels import kernel
 from sim.linear_algebra import nearest_rotation, rotation_near
 
 COUNT = 336_000
@@ -30,25 +31,23 @@ def matrices() -> np.ndarray:
     return all_kinds.astype(np.float32)
 
 
+@kernel
+def extract(given: ti.template(), guess: ti.template(), found: ti.template(), is_near: ti.template()):
+    for i in range(given.shape[0]):
+        if ti.static(is_near):
+            found[i] = rotation_near(guess[i], given[i])
+        else:
+            found[i] = nearest_rotation(given[i])
+
+
 def rotations(values: np.ndarray, guesses: np.ndarray | None = None) -> np.ndarray:
-    given = ti.Matrix.field(3, 3, ti.f32, len(values))
-    guess = ti.Matrix.field(3, 3, ti.f32, len(values))
-    found = ti.Matrix.field(3, 3, ti.f32, len(values))
+    given = zeros(len(values), 3, 3, within=2)
+    guess = zeros(len(values), 3, 3, within=2)
+    found = zeros(len(values), 3, 3, within=2)
     fill((given, values))
     if guesses is not None:
         fill((guess, guesses))
-
-    @ti.kernel
-    def extract():
-        for i in given:
-            found[i] = nearest_rotation(given[i])
-
-    @ti.kernel
-    def extract_near():
-        for i in given:
-            found[i] = rotation_near(guess[i], given[i])
-
-    extract() if guesses is None else extract_near()
+    extract(given, guess, found, guesses is not None)
     return array_of(found).astype(np.float64)
 
 

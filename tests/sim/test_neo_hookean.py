@@ -22,7 +22,8 @@ from scipy.linalg import polar
 from scipy.optimize import brentq
 
 from sim.body import Body, BodyState
-from sim.fields import array_of, fill
+from sim.fields import array_of, fill, zeros
+from sim.kernels import kernel
 from sim.lattice import ERSATZ, Lattice, fill_with_cells
 from sim.neo_hookean import HOURGLASS_STIFFNESS, LEAST_J, NeoHookean, ln
 from sim.shapes import ConvexTool, Plane
@@ -33,21 +34,21 @@ DT = 1 / 60
 EPS = 2.0**-23
 
 
-@ti.kernel
+@kernel
 def begin(model: ti.template(), dt: float):
     model.begin(dt)
     model.gather()
 
 
-@ti.kernel
+@kernel
 def project(model: ti.template(), factor: float, dt: float):
     model.project(1.0, factor, dt)
     model.scatter()
 
 
-@ti.kernel
+@kernel
 def measure(model: ti.template(), force: ti.template(), hessian: ti.template()):
-    for i in force:
+    for i in range(force.shape[0]):
         f, h, _ = model.elastic(i)
         force[i], hessian[i] = f.xyz, h
 
@@ -56,7 +57,7 @@ def forces_of(model: NeoHookean, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     """Elastic forces (n, 3) [uN] at positions x, and their negative derivatives (n, 3, 3) by each node's position."""
     put(model, x)
     begin(model, DT)
-    force, hessian = ti.Vector.field(3, ti.f32, len(x)), ti.Matrix.field(3, 3, ti.f32, len(x))
+    force, hessian = zeros(len(x), 3, within=1), zeros(len(x), 3, 3, within=2)
     measure(model, force, hessian)
     return array_of(force).astype(float), array_of(hessian).astype(float)
 
@@ -119,7 +120,7 @@ def test_force_and_hessian_are_the_energys_derivatives(kept, noise_mm):
 def test_youngs_modulus_changes_the_penalty_stiffness_and_not_poissons_ratio(one_device, block):
     model = tissue_of(block, 8.0, [Plane(np.array([0.0, 0.0, 1.0]), -8.0)], poisson=0.3).model
     model.set_material(2 * YOUNG_KPA)
-    found = model.mu[None], model.lambda_[None], model.contacts.stiffness[None]
+    found = model.mu, model.lambda_, model.contacts.stiffness
     assert found == pytest.approx(
         [2 * each for each in (*lame_parameters(0.3), YOUNG_KPA / PENALTY_DEPTH_MM)], rel=1e-6
     )
@@ -129,15 +130,15 @@ def test_the_logarithm_is_exact_to_rounding(one_device):
     values = np.concatenate([np.geomspace(LEAST_J, 1e30, 4000), 1 + np.linspace(-0.4, 0.4, 4001)]).astype(
         np.float32
     )
-    given, found = ti.field(ti.f32, len(values)), ti.field(ti.f32, len(values))
+    given, found = zeros(len(values)), zeros(len(values))
     fill((given, values))
 
-    @ti.kernel
-    def ask():
-        for i in given:
+    @kernel
+    def ask(given: ti.template(), found: ti.template()):
+        for i in range(given.shape[0]):
             found[i] = ln(given[i])
 
-    ask()
+    ask(given, found)
     wanted = np.log(values.astype(float))
     # Of the sum of exponent and series each rounds by half a unit, the series' own terms by three more.
     assert (np.abs(array_of(found) - wanted) <= 4 * EPS * np.maximum(np.abs(wanted), 0.35)).all()

@@ -9,12 +9,13 @@ import trimesh
 from conftest import rotation_about
 from test_solver import on_floor, position, solver_of
 
-from sim.fields import array_of, fill
+from sim.fields import array_of, fill, zeros
+from sim.kernels import kernel
 from sim.shapes import FAR, ConvexTool, Plane, SignedDistanceField
 from sim.solver import Solver, StepSettings
 
 
-@ti.kernel
+@kernel
 def ask(
     shape: ti.template(), points: ti.types.ndarray(ti.f32, ndim=2), answers: ti.types.ndarray(ti.f32, ndim=2)
 ):
@@ -74,10 +75,10 @@ def test_a_rounded_cuboid_keeps_its_size_and_loses_its_corners(one_device):
 
 def test_the_nearest_point_outside_a_rounded_cuboid_is_just_outside_its_face(one_device):
     tool = ConvexTool.cuboid(np.array([12.0, 6.0, 8.0]), 1.0)
-    out = ti.Vector.field(3, ti.f32, 6)
+    out = zeros(6, 3, within=1)
 
-    @ti.kernel
-    def ask(x: float, y: float, z: float):
+    @kernel
+    def ask(tool: ti.template(), out: ti.template(), x: float, y: float, z: float):
         for k in range(6):
             out[k] = tool.outside(ti.Vector([x, y, z]), k)
 
@@ -85,7 +86,7 @@ def test_the_nearest_point_outside_a_rounded_cuboid_is_just_outside_its_face(one
     away[:3, :3], away[:3, 3] = rotation_about([1, 2, 3], 70), [20.0, -10.0, 5.0]
     for pose in (np.eye(4), away):
         tool.move(pose, pose)
-        ask(*(pose @ [1.0, 0.5, -0.5, 1.0])[:3])
+        ask(tool, out, *(pose @ [1.0, 0.5, -0.5, 1.0])[:3])
         for point, k in zip(array_of(out), range(6), strict=True):
             expected = np.array([1.0, 0.5, -0.5, 1.0])
             expected[k % 3] = (1 if k < 3 else -1) * ([6.0, 3.0, 4.0][k % 3] + 1e-3)
@@ -104,14 +105,14 @@ def test_the_motion_of_a_tools_material_is_that_of_its_poses(one_device):
     before, now = np.eye(4), np.eye(4)
     now[:3, :3], now[:3, 3] = rotation_about([0, 0, 1], 3), [0.5, 0.0, -0.2]
     tool.move(before, now)
-    moved = ti.Vector.field(3, ti.f32, ())
+    moved = zeros(3, within=1)
 
-    @ti.kernel
-    def ask(x: float, y: float, z: float):
+    @kernel
+    def ask(tool: ti.template(), moved: ti.template(), x: float, y: float, z: float):
         moved[None] = tool.motion(ti.Vector([x, y, z]))
 
     material = np.array([1.0, 2.0, -2.0, 1.0])
-    ask(*(now @ material)[:3])
+    ask(tool, moved, *(now @ material)[:3])
     assert np.abs(array_of(moved) - (now @ material - material)[:3]).max() < 1e-6
 
 
@@ -164,15 +165,15 @@ def test_the_quick_distance_test_of_a_tool_has_no_false_positives(one_device, ed
     tool.move(pose, pose)
     points = scattered()
     _, distance = measured(tool, points)
-    given, beyond = ti.Vector.field(3, ti.f32, len(points)), ti.field(ti.i32, len(points))
+    given, beyond = zeros(len(points), 3, within=1), zeros(len(points), kind=ti.i32)
     fill((given, points))
 
-    @ti.kernel
-    def ask():
-        for i in given:
+    @kernel
+    def ask(tool: ti.template(), given: ti.template(), beyond: ti.template()):
+        for i in range(given.shape[0]):
             beyond[i] = ti.cast(tool.is_beyond(given[i], 2.0), ti.i32)
 
-    ask()
+    ask(tool, given, beyond)
     told = array_of(beyond) > 0
     assert (distance[told] > 2.0).all()
     # It sees most of what is beyond, all but what is near to an edge's or corner's corner.
@@ -271,7 +272,7 @@ def test_a_dragged_tool_moves_the_surface_by_friction(kept, block):
 def oracle_of_pushes(solver: Solver, x: np.ndarray, motion: np.ndarray, iterations: int, factor: float):
     """Where particles (n, 3) go in iterations of pushes with Coulomb's friction in float64; how many of those slid, and had two shapes."""
     contacts, start = solver.contacts, position(solver)
-    plane, touched = array_of(contacts.contact.plane).astype(float), array_of(contacts.touched)
+    plane, touched = array_of(contacts.plane).astype(float), array_of(contacts.touched)
     x, slid, several = x.copy(), 0, 0
     for i in range(len(x)):
         shapes = [s for s in range(len(contacts.shapes)) if touched[i] >> s & 1]
@@ -313,8 +314,8 @@ def test_pushes_and_friction_are_the_oracles(kept, block, factor):
     body, contacts = solver.body, solver.contacts
     fill((body.velocity, np.random.default_rng(8).normal(0, 20, (body.count, 3))))
 
-    @ti.kernel
-    def push():
+    @kernel
+    def push(body: ti.template(), contacts: ti.template()):
         for i in range(body.count):
             body.predicted[i] += contacts.pushed(i, body.predicted[i], factor)
 
@@ -327,7 +328,7 @@ def test_pushes_and_friction_are_the_oracles(kept, block, factor):
         )
         assert slid > 30 and several > 10
         for _ in range(3):
-            push()
+            push(body, contacts)
         # Float32 positions of 12 mm carry 1e-6 mm, and the same of each plane's offset, in each of three iterations.
         assert np.abs(array_of(body.predicted) - wanted).max() < 2e-5
 

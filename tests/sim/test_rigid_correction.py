@@ -8,6 +8,7 @@ from conftest import rotation_about
 
 from sim.body import Body, BodyState
 from sim.fields import array_of, field_of, fill
+from sim.kernels import kernel
 from sim.lattice import fill_with_cells
 from sim.neo_hookean import NeoHookean
 from sim.rigid_correction import RigidCorrection
@@ -15,7 +16,7 @@ from sim.rigid_correction import RigidCorrection
 DT = 1 / 60
 
 
-@ti.kernel
+@kernel
 def begin(model: ti.template(), dt: float):
     model.begin(dt)
 
@@ -44,7 +45,7 @@ def test_any_rigid_way_is_found_whole(kept, serial, spin):
     assert np.abs(array_of(model.body.predicted) - wanted).max() < 1.2e-5
 
 
-@ti.kernel
+@kernel
 def move(rigid: ti.template(), dt: float):
     rigid.move(dt)
 

@@ -11,6 +11,7 @@ from test_solver import on_floor, solver_of
 
 from sim.body import BodyState, ParticleBody
 from sim.fields import array_of, fill
+from sim.kernels import kernel
 from sim.sampling import fill_body, group_into_patches, sample_clusters
 from sim.shape_matching import ShapeMatching
 from sim.shapes import Plane
@@ -19,7 +20,7 @@ from sim.shapes import Plane
 ROUNDING_MM = 3e-5
 
 
-@ti.kernel
+@kernel
 def project(model: ti.template(), stiffness: float, factor: float):
     model.begin(0.0)
     model.gather()
@@ -104,14 +105,14 @@ def test_patches_follow_their_particles_after_contact(one_device, block, relaxat
     model.body.restore(BodyState(x.astype(np.float32), np.zeros(x.shape, np.float32)))
     model.update_frames()
 
-    @ti.kernel
-    def pressed():
+    @kernel
+    def pressed(model: ti.template()):
         model.begin(0.0)
         model.contacts.find()
         model.gather()
         model.project(0.9, 1.0, 0.0)
 
-    pressed()
+    pressed(model)
     predicted = array_of(model.predicted)[:, :3].astype(float)
     touched = np.bincount(patches.of_particles(), array_of(model.contacts.touched) > 0)
     assert 10 < (touched[:several] > 0).sum() < several - 10
@@ -126,7 +127,7 @@ def test_patches_follow_their_particles_after_contact(one_device, block, relaxat
         assert np.abs(moment[p][:3, :3] - wanted).max() < 7 * patches.sizes[p] * ROUNDING_MM
 
 
-@ti.kernel
+@kernel
 def push_out(model: ti.template(), factor: float):
     model.contacts.find()
     model.gather()

@@ -7,7 +7,8 @@ import trimesh
 from lattice_tissue import DENSITY, YOUNG_KPA, G, jacobians, lifted, position, put, settings_of, tissue_of
 
 from sim.body import BodyState
-from sim.fields import array_of, fill
+from sim.fields import array_of, fill, zeros
+from sim.kernels import kernel
 from sim.shapes import ConvexTool, Plane, SignedDistanceField
 from sim.surface_contact import NEAR_MM, PENALTY_DEPTH_MM, REACH_MM, TANGENTIAL_RATIO
 
@@ -155,16 +156,16 @@ def test_sticking_points_move_with_the_tool(kept, dome):
     assert (np.abs(moved - aside) < 2 * most)[held].all()
 
 
-@ti.kernel
+@kernel
 def ask(contacts: ti.template(), pushed: ti.template(), held: ti.template(), at: ti.template()):
     """Forces, as rows 0, and stiffnesses of ``node_force`` at each node, and of ``point_force`` of each point at a position."""
-    for i in pushed:
+    for i in range(pushed.shape[0]):
         force, stiffness = contacts.node_force(i)
         for row in ti.static(range(3)):
             pushed[i][0, row] = force[row]
             for column in ti.static(range(3)):
                 pushed[i][1 + row, column] = stiffness[row, column]
-    for q in held:
+    for q in range(held.shape[0]):
         force, stiffness = contacts.point_force(q, at[q], True)
         for row in ti.static(range(3)):
             held[q][0, row] = force[row]
@@ -200,9 +201,9 @@ def test_forces_and_stiffnesses_are_those_of_the_penalty_law(kept, dome):
     tool.move(*poses)
     known = array_of(contacts.point).astype(float)
     places = known + np.random.default_rng(9).normal(0, 0.02, known.shape)
-    at = ti.Vector.field(3, ti.f32, contacts.count)
+    at = zeros(contacts.count, 3, within=1)
     fill((at, places))
-    pushed, held = (ti.Matrix.field(4, 3, ti.f32, n) for n in (solver.body.count, contacts.count))
+    pushed, held = (zeros(n, 4, 3, within=2) for n in (solver.body.count, contacts.count))
     ask(contacts, pushed, held, at)
     # Rounding of 1e-6 mm is a few thousandths of a percent of the deepest, and of the largest slip.
     pushed, held = (array_of(each).astype(float) for each in (pushed, held))
@@ -406,7 +407,7 @@ def test_the_wrench_is_the_sum_of_the_forces_on_the_points(one_device, block):
     plane, near = array_of(contacts.plane)[1].astype(float), array_of(contacts.near) >> 1 & 1
     point, slip = array_of(contacts.point).astype(float), array_of(contacts.slip)[1].astype(float)
     depth = np.maximum(plane[:, 3] - (plane[:, :3] * point).sum(axis=1), 0.0) * near
-    stiffness = 1e3 * contacts.stiffness[None] * array_of(contacts.area).astype(float)
+    stiffness = 1e3 * contacts.stiffness * array_of(contacts.area).astype(float)
     force = (stiffness * depth)[:, None] * plane[:, :3]
     force -= TANGENTIAL_RATIO * (stiffness * (depth > 0))[:, None] * slip
     wanted = -1e-6 * np.concatenate([force.sum(axis=0), np.cross(point - about, force).sum(axis=0)])

@@ -17,6 +17,7 @@ import app
 from rehearsal.configuration import setup_of
 from sim.body import BodyState
 from sim.fields import array_of
+from sim.kernels import kernel
 from sim.neo_hookean import LATTICE_SETTINGS
 from sim.self_contact import SelfContacts
 from sim.shapes import ConvexTool, Plane
@@ -74,8 +75,8 @@ def test_the_bound_in_c_computes_what_shape_matching_does(device, block):
     x = plain.x.copy()
     model.body.restore(BodyState(x, np.zeros_like(x)))
 
-    @ti.kernel
-    def match(iterations: int):
+    @kernel
+    def match(model: ti.template(), iterations: int):
         ti.loop_config(serialize=True)
         for _once in range(1):
             model.gather()
@@ -83,7 +84,7 @@ def test_the_bound_in_c_computes_what_shape_matching_does(device, block):
                 model.project(lower_bound.STIFFNESS, 1.0, 0.0)
             model.scatter()
 
-    match(3)
+    match(model, 3)
     plain.run(3, 2)
     assert np.abs(plain.x - x).max() > 1e-3
     # Both round at 15 mm, 1e-6 mm, in each of the operations of three passes.

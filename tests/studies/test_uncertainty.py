@@ -89,7 +89,7 @@ def test_values_reach_the_solver(device, problem):
     assert array_of(model.capsule.weight) == pytest.approx(2 * weight) and array_of(
         model.tether
     ) == pytest.approx(2 * tether)
-    assert rehearsal.contacts.coefficient[None] == pytest.approx(0.2)
+    assert rehearsal.contacts.coefficient == pytest.approx(0.2)
 
 
 @pytest.mark.usefixtures("nothing_built")

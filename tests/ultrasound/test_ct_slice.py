@@ -15,7 +15,8 @@ from slicing import hounsfield, organ_mask
 
 from sim.body import BodyState
 from sim.embedding import Embedding, Unmoved, tetrahedra_around
-from sim.fields import array_of, fill
+from sim.fields import array_of, fill, fill_evenly
+from sim.kernels import kernel
 from sim.shape_matching import ShapeMatching
 from sim.skinning import Skin
 from ultrasound.plane_in_tissue import PlaneInTissue
@@ -189,13 +190,13 @@ def test_pixels_drawn_together_show_what_each_shows_alone(kept, ball, pixels, ou
     cut, _, _, _ = sliced(kept, ball, ramp_image, bent, pixels, outside)
     alone = np.zeros((pixels, pixels), np.float32)
 
-    @ti.kernel
-    def ask(alone: ti.types.ndarray(ti.f32, ndim=2)):
-        for row, column in ti.ndrange(pixels, pixels):
+    @kernel
+    def ask(cut: ti.template(), alone: ti.types.ndarray(ti.f32, ndim=2)):
+        for row, column in ti.ndrange(alone.shape[0], alone.shape[1]):
             rest = cut.plane.rest_at(row, column, cut.plane.grid[0], cut.plane.grid[1])
             alone[row, column] = cut.ct.sample(rest)
 
-    ask(alone)
+    ask(cut, alone)
     if outside == "gel":
         alone[~organ_mask(cut)] = 0.0
     # Places of 15 mm in float32 carry 1e-6 mm, maps ten times that; the ramp has 14 HU/mm.
@@ -208,13 +209,17 @@ def test_the_pixel_near_a_place_is_the_nearest(one_device):
     places = np.random.default_rng(6).uniform([-20, -8], [20, 18], (300, 2)).astype(np.float32)
     found = np.zeros((300, 2), np.int32)
 
-    @ti.kernel
-    def ask(places: ti.types.ndarray(ti.f32, ndim=2), found: ti.types.ndarray(ti.i32, ndim=2)):
+    @kernel
+    def ask(
+        plane: ti.template(),
+        places: ti.types.ndarray(ti.f32, ndim=2),
+        found: ti.types.ndarray(ti.i32, ndim=2),
+    ):
         for i in range(300):
             at = tm.vec2(places[i, 0], places[i, 1])
             found[i, 0], found[i, 1] = plane.pixel_near(at)
 
-    ask(places, found)
+    ask(plane, places, found)
     middles = (np.arange(24) + 0.5) / 24
     u, v = middles * 30.0 - 15.0, middles * 18.0 - 4.0
     assert np.array_equal(found[:, 0], np.abs(places[:, 1:] - v).argmin(axis=1))
@@ -302,7 +307,7 @@ def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(kept
     matrices = [ti.Matrix(each.tolist()) for each in given]
     other = copy(embedding)
     other.serial = not embedding.serial
-    cut.plane.owner.fill(-1)
+    fill_evenly(cut.plane.owner, -1)
     other.locate_on_plane(*matrices, *cut.plane.shape, cut.plane.owner)
     assert np.array_equal(array_of(cut.plane.owner), owner)
 

@@ -8,7 +8,8 @@ import trimesh
 from conftest import rotation_about
 from scipy.interpolate import RegularGridInterpolator
 
-from sim.fields import array_of, fill
+from sim.fields import array_of, fill, zeros
+from sim.kernels import kernel
 from ultrasound.sampled_volume import LANES, Lanes, SampledVolume, distance_volume
 
 
@@ -21,18 +22,24 @@ def test_a_volume_of_vectors_is_sampled_as_each_of_its_parts(device):
         [SampledVolume(voxels[..., k], index_from_mm) for k in range(2)],
     )
     points = np.random.default_rng(3).uniform(-1.0, 4.0, (200, 3)).astype(np.float32)
-    given, found = ti.Vector.field(3, ti.f32, len(points)), ti.Vector.field(2, ti.f32, len(points))
-    apart = ti.Vector.field(2, ti.f32, len(points))
+    given, found = zeros(len(points), 3, within=1), zeros(len(points), 2, within=1)
+    apart = zeros(len(points), 2, within=1)
     fill((given, points))
 
-    @ti.kernel
-    def ask():
-        for i in given:
+    @kernel
+    def ask(
+        whole: ti.template(),
+        parts: ti.template(),
+        given: ti.template(),
+        found: ti.template(),
+        apart: ti.template(),
+    ):
+        for i in range(given.shape[0]):
             found[i] = whole.sample(given[i])
             for k in ti.static(range(2)):
                 apart[i][k] = parts[k].sample(given[i])
 
-    ask()
+    ask(whole, parts, given, found, apart)
     # The compiler may fuse the same sums differently: rounding of values of 4, at a place rounded to 1e-6 of a voxel.
     assert array_of(found) == pytest.approx(array_of(apart), abs=1e-5)
     assert (array_of(found) != -1000.0).any() and (array_of(found) == -1000.0).any()
@@ -55,8 +62,8 @@ def test_places_sampled_together_have_the_values_that_they_have_alone(device, sh
     together, alone = np.zeros((2, 400, LANES), np.float32)
     values = ti.types.ndarray(ti.f32, ndim=2)
 
-    @ti.kernel
-    def ask(places: ti.types.ndarray(ti.f32, ndim=3), together: values, alone: values):
+    @kernel
+    def ask(volume: ti.template(), places: ti.types.ndarray(ti.f32, ndim=3), together: values, alone: values):
         for i in range(places.shape[0]):
             x, y, z = Lanes(0.0), Lanes(0.0), Lanes(0.0)
             for lane in ti.static(range(LANES)):
@@ -66,7 +73,7 @@ def test_places_sampled_together_have_the_values_that_they_have_alone(device, sh
             for lane in ti.static(range(LANES)):
                 together[i, lane] = found[lane]
 
-    ask(places, together, alone)
+    ask(volume, places, together, alone)
     assert 0.1 < (alone == -7.0).mean() < 0.9 and np.abs(together - alone).max() < 1e-5
 
 
@@ -78,16 +85,22 @@ def test_the_gradient_of_a_volume_is_that_over_a_voxel_to_each_side_and_its_slop
     last = np.array([5.0, 4.0, 3.0])
     inside = np.random.default_rng(5).uniform(-0.45, last + 0.45, (300, 3))
     points = np.vstack([inside, last + 0.6]) @ np.linalg.inv(index_from_mm[:3, :3]).T
-    given, gradient, slope = (ti.Vector.field(3, ti.f32, len(points)) for _ in range(3))
+    given, gradient, slope = (zeros(len(points), 3, within=1) for _ in range(3))
     fill((given, points))
 
-    @ti.kernel
-    def ask():
-        for i in given:
+    @kernel
+    def ask(
+        volume: ti.template(),
+        first_part: ti.template(),
+        given: ti.template(),
+        gradient: ti.template(),
+        slope: ti.template(),
+    ):
+        for i in range(given.shape[0]):
             gradient[i] = volume.gradient(given[i])
             slope[i] = first_part.slope(given[i])
 
-    ask()
+    ask(volume, first_part, given, gradient, slope)
     value = RegularGridInterpolator([np.arange(n) for n in (6, 5, 4)], voxels[..., 0].astype(float))
     middle, along = np.clip(inside, 0, last), np.empty((300, 3))
     for axis in range(3):
@@ -116,16 +129,16 @@ def test_a_volume_is_trilinear_between_voxels_and_ends_half_a_voxel_beyond(devic
     points = np.array(
         [[0, 0, 0], [4, 3, 2], [1.25, 2.5, 0.75], [-0.4, 1, 1], [-0.6, 1, 1], [4.6, 3, 2]], np.float32
     )
-    given = ti.Vector.field(3, ti.f32, len(points))
-    found = ti.field(ti.f32, len(points))
+    given = zeros(len(points), 3, within=1)
+    found = zeros(len(points))
     fill((given, points))
 
-    @ti.kernel
-    def ask():
-        for i in given:
+    @kernel
+    def ask(volume: ti.template(), given: ti.template(), found: ti.template()):
+        for i in range(given.shape[0]):
             found[i] = volume.sample(given[i])
 
-    ask()
+    ask(volume, given, found)
     cell = voxels[1:3, 2:4, 0:2].astype(float)
     mixed = np.einsum("ijk,i,j,k->", cell, [0.75, 0.25], [0.5, 0.5], [0.25, 0.75])
     wanted = [voxels[0, 0, 0], voxels[4, 3, 2], mixed, voxels[0, 1, 1], -7.0, -7.0]
@@ -134,14 +147,14 @@ def test_a_volume_is_trilinear_between_voxels_and_ends_half_a_voxel_beyond(devic
 
 def test_a_volume_of_one_slice_is_sampled_within_its_thickness(device):
     volume = SampledVolume(np.full((3, 3, 1), 5.0, np.float32), np.eye(4))
-    found = ti.field(ti.f32, 2)
+    found = zeros(2)
 
-    @ti.kernel
-    def ask():
+    @kernel
+    def ask(volume: ti.template(), found: ti.template()):
         found[0] = volume.sample(ti.Vector([1.2, 0.7, 0.3]))
         found[1] = volume.sample(ti.Vector([1.2, 0.7, 0.7]))
 
-    ask()
+    ask(volume, found)
     assert array_of(found) == pytest.approx([5.0, -1000.0])
 
 

@@ -1,0 +1,216 @@
+"""A kernel takes fields and numbers of its object when it runs, and is compiled once for objects that are alike."""
+
+import gc
+import weakref
+
+import numpy as np
+import pytest
+import taichi as ti
+
+from sim.fields import Field, array_of, field_of, fill, zeros
+from sim.kernels import kernel
+
+Numbers = ti.types.ndarray(ti.f32, ndim=2)
+
+
+class Plain:
+    """Adds what it has to each of its numbers."""
+
+    def __init__(self, values: np.ndarray, shift: float = 0.0, turns: bool = False) -> None:
+        self.values, self.count, self.shift, self.turns = field_of(values), len(values), shift, turns
+        self.pair = 1, 0.25
+
+    @ti.func
+    def added(self):
+        return self.shift + self.pair[0] * self.pair[1]
+
+    @kernel
+    def add(self, more: float):
+        for i in range(self.count):
+            self.values[i] = self.values[i] + more + self.added()
+            if ti.static(self.turns):
+                self.values[i] = -self.values[i]
+
+    @kernel
+    def total(self) -> float:
+        total = 0.0
+        for i in range(self.count):
+            total += self.values[i]
+        return total
+
+
+class Owner:
+    """An object within an object, and a list of them."""
+
+    def __init__(self, parts: list[Plain]) -> None:
+        self.parts, self.first = parts, parts[0]
+
+    @kernel
+    def add(self, which: ti.template(), into: ti.template()):
+        for _ in range(1):
+            for part in ti.static(self.parts):
+                into[0] = into[0] + part.added()
+            into[which] = into[which] + self.first.values[which]
+
+
+class Other(Plain):
+    @ti.func
+    def added(self):
+        return 100.0
+
+
+def compiled(bound) -> int:
+    return len(bound.__func__._compiled)
+
+
+def test_objects_of_all_sizes_share_a_kernel_and_each_has_its_own_numbers(device):
+    small, large = Plain(np.arange(3.0), 0.5), Plain(np.arange(1000.0), -2.0)
+    before = compiled(small.add) if small.add.__func__._program else 0
+    small.add(1.0)
+    large.add(2.0)
+    assert compiled(small.add) == max(before, 1)
+    assert np.array_equal(array_of(small.values), np.arange(3) + 1.75)
+    assert np.array_equal(array_of(large.values), np.arange(1000) + 0.25)
+    assert small.total() == pytest.approx(3 + 3 * 1.75)
+
+
+def test_numbers_and_fields_that_change_count_from_the_next_call(device):
+    thing = Plain(np.zeros(4))
+    thing.add(0.0)
+    thing.shift, thing.count, thing.pair = 3.0, 2, (2, 0.5)
+    thing.add(0.0)
+    assert np.array_equal(array_of(thing.values), [4.25, 4.25, 0.25, 0.25])
+    before, thing.values = thing.values, field_of(np.full(2, 10.0))
+    thing.add(0.0)
+    assert np.array_equal(array_of(thing.values), [14.0, 14.0])
+    assert np.array_equal(array_of(before), [4.25, 4.25, 0.25, 0.25])
+
+
+def test_a_flag_that_changes_is_another_kernel(device):
+    thing = Plain(np.ones(2))
+    thing.add(0.0)
+    count = compiled(thing.add)
+    thing.turns = True
+    thing.add(0.0)
+    assert np.array_equal(array_of(thing.values), [-1.5, -1.5]) and compiled(thing.add) == count + 1
+    thing.turns = False
+    thing.add(0.0)
+    assert np.array_equal(array_of(thing.values), [-1.25, -1.25]) and compiled(thing.add) == count + 1
+
+
+def test_objects_of_another_class_have_a_kernel_of_their_own(device):
+    plain, other = Plain(np.zeros(1)), Other(np.zeros(1))
+    plain.add(0.0)
+    other.add(0.0)
+    assert (array_of(plain.values)[0], array_of(other.values)[0]) == (0.25, 100.0)
+
+
+def test_parts_in_lists_and_fields_and_numbers_as_parameters(device):
+    parts = [Plain(np.array([5.0, 6.0]), 1.0), Plain(np.zeros(2), 2.0)]
+    owner, into, others = Owner(parts), zeros(2), zeros(3)
+    owner.add(1, into)
+    owner.add(0, others)
+    assert np.array_equal(array_of(into), [3.5, 6.0]) and np.array_equal(array_of(others), [8.5, 0.0, 0.0])
+    # A longer list is another kernel; one of the same length with other objects is not.
+    count = compiled(owner.add)
+    Owner(parts[::-1]).add(1, into)
+    assert compiled(owner.add) == count
+    Owner([*parts, parts[0]]).add(1, into)
+    assert compiled(owner.add) == count + 1 and array_of(into)[0] == 3.5 + 3.5 + 4.75
+
+
+def test_an_object_and_its_fields_are_freed(device):
+    thing = Plain(np.zeros(2))
+    thing.add(1.0)
+    owner, field = weakref.ref(thing), weakref.ref(thing.values)
+    del thing
+    gc.collect()
+    assert owner() is None and field() is None
+
+
+def test_a_value_that_is_neither_number_nor_field_is_named(device):
+    class Wrong:
+        def __init__(self) -> None:
+            self.values, self.table = zeros(2), np.zeros(3)
+
+        @kernel
+        def copy(self):
+            for i in range(2):
+                self.values[i] = self.table[i]
+
+    with pytest.raises(Exception, match="table"):
+        Wrong().copy()
+
+
+class Elements:
+    """Vectors and matrices, whole and in part."""
+
+    def __init__(self, vectors: np.ndarray, matrices: np.ndarray) -> None:
+        self.vector, self.matrix = field_of(vectors, 1), field_of(matrices, 2)
+        self.count, self.out = len(vectors), zeros(*vectors.shape, within=1)
+
+    @kernel
+    def change(self):
+        for i in range(self.count):
+            self.out[i] = self.matrix[i] @ self.vector[i]
+            self.vector[i].y = 5.0
+            self.vector[i][2] = 6.0 + i
+            for k in range(3):
+                self.vector[i][0] = self.vector[i][0] + self.vector[i][k]
+            self.matrix[i] = 2.0 * self.matrix[i]
+            self.matrix[i][1, 0] = -1.0
+            self.matrix[i][2, :] = self.vector[i]
+            self.out[i] += self.vector[i]
+
+
+def test_elements_are_read_and_written_whole_and_in_part(device):
+    random = np.random.default_rng(0)
+    vectors, matrices = random.integers(-9, 9, (4, 3)).astype(float), random.integers(-9, 9, (4, 3, 3)) * 1.0
+    thing = Elements(vectors, matrices)
+    thing.change()
+    product = np.einsum("nij,nj->ni", matrices, vectors)
+    vectors[:, 1], vectors[:, 2] = 5.0, 6.0 + np.arange(4)
+    for k in range(3):
+        vectors[:, 0] += vectors[:, k]
+    matrices *= 2
+    matrices[:, 1, 0], matrices[:, 2] = -1.0, vectors
+    assert np.array_equal(array_of(thing.vector), vectors) and np.array_equal(
+        array_of(thing.matrix), matrices
+    )
+    assert np.array_equal(array_of(thing.out), product + vectors)
+
+
+class Grid:
+    """A field of two axes, and an array given at the call."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self.field: Field = zeros(*shape)
+        self.rows, self.columns = shape
+
+    @kernel
+    def fill_and_copy(self, image: Numbers):
+        for i, j in ti.ndrange(self.rows, self.columns):
+            self.field[i, j] = 10.0 * i + j
+            image[i, j] = self.field[i, j]
+
+
+@pytest.mark.parametrize("shape", [(2, 3), (3, 2), (7, 1)])
+def test_each_axis_may_have_any_length(device, shape):
+    grid, image = Grid(shape), np.zeros(shape, np.float32)
+    grid.fill_and_copy(image)
+    wanted = 10.0 * np.arange(shape[0])[:, None] + np.arange(shape[1])
+    assert np.array_equal(image, wanted) and np.array_equal(array_of(grid.field), wanted)
+    for wrong in (image[:, ::-1][::-1] if min(shape) > 1 else image[::2], image.astype(float), image[0]):
+        with pytest.raises(ValueError, match="expected float32 with 2 axes, contiguous"):
+            grid.fill_and_copy(wrong)
+
+
+def test_fields_of_other_kinds_are_other_kernels(device):
+    thing = Plain(np.zeros(3))
+    thing.add(1.0)
+    count = compiled(thing.add)
+    thing.values = field_of(np.arange(3))
+    thing.add(1.75)
+    # Integers are cut off.
+    assert compiled(thing.add) == count + 1 and array_of(thing.values).tolist() == [2, 3, 4]
+    fill((thing.values, np.zeros(3)))
