@@ -8,6 +8,7 @@ from cut_ball import ANGLE, MARKS, R, ball, circle, inset
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rehearsal.resection.operation import _nearest_to_probe
 from rehearsal.resection.proposal import marks_around
 from rehearsal.resection.resection_state import MOST_MARKS, NO_RESECTION, CutRequest
 from rehearsal.resection.score_line import (
@@ -139,6 +140,23 @@ def test_the_order_of_the_marks_keeps_a_bent_outline_from_crossing_itself():
     set_marks = np.array([[-30, 0, 2], [30, 20, 2], [30, 0, 2], [-30, 20, 2], [0, 25, 2]], float)
     assert crosses_itself(set_marks[:, :2])
     assert not crosses_itself(score_line(plate, set_marks).marks[:, :2])
+
+
+@pytest.mark.parametrize("across_mm", [-9.0, 3.0, 14.0])
+def test_a_mark_of_the_image_is_on_the_capsule_nearest_to_the_probe(across_mm):
+    """A section like an oblique ellipse: of both places at a lateral position, the shallower one."""
+    half, turn, middle = np.array([20.0, 12.0]), rotation_about([0, 0, 1], 25)[:2, :2], np.array([3.0, 24.0])
+    angle = np.linspace(0, 2 * np.pi, 1001)
+    points = half * np.column_stack([np.cos(angle), np.sin(angle)]) @ turn.T + middle
+    found = _nearest_to_probe(np.stack([points[:-1], points[1:]], axis=1), across_mm)
+    # x' A x = 1, with x from the middle: a quadratic equation in the depth.
+    form = turn @ np.diag(half**-2.0) @ turn.T
+    aside = across_mm - middle[0]
+    roots = np.roots([form[1, 1], 2 * form[0, 1] * aside, form[0, 0] * aside**2 - 1])
+    # Chords of 0.1 mm are inside the ellipse by less than 0.001 mm.
+    assert found == pytest.approx((across_mm, middle[1] + roots.min()), abs=1e-3)
+    with pytest.raises(ResectionError, match="ends before the edge"):
+        _nearest_to_probe(np.stack([points[:-1], points[1:]], axis=1), 30.0)
 
 
 def test_marks_are_added_until_there_are_too_many_or_a_cut():

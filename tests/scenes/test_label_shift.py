@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import SimpleITK as sitk
+from scipy.spatial.transform import Rotation
 from synthetic_body import BODY, DIRECTIONS, LEFT, TUMOUR, drawn, grid_around, level, points_of, with_voxels
 
 from scenes.patients.label_shift import LATTICE_MM, LEAST_MM, best_shift, shift_warnings
@@ -24,10 +25,14 @@ WORDS = [
 ]
 
 
+# No axis along one of the patient, and none of them exchanged with another alone.
+TURNED = Rotation.from_rotvec(75 * np.array([1, 2, 2]) / 3, degrees=True).as_matrix()
+
+
 def scanned(spacing=(1.5, 1.5, 3.0), direction="identity", beside=30.0, noise_hu=15.0):
     """CT and organ of a left kidney with a tumour, in fat but for a neighbour at its front, on one grid."""
     low, high = LEFT[0] - LEFT[1] - 30, LEFT[0] + LEFT[1] + 30
-    empty = grid_around(low, high, spacing, DIRECTIONS[direction])
+    empty = grid_around(low, high, spacing, DIRECTIONS.get(direction, TURNED))
     beside_it = LEFT[0] - [0, 60, 0], np.array([80.0, 42.0, 80.0])
     ct = drawn(empty, (-100, BODY), (int(beside), beside_it), (120, LEFT), (70, TUMOUR))
     hounsfield = sitk.GetArrayFromImage(ct) + np.random.default_rng(3).normal(
@@ -48,7 +53,7 @@ def ct_and_organ():
 
 @pytest.fixture(scope="module")
 def thick():
-    return scanned(spacing=(0.8, 0.8, 8.0))
+    return scanned(spacing=(0.8, 1.0, 8.0), direction="turned")
 
 
 @pytest.mark.parametrize(("shift", "words"), [*zip(SHIFTS, WORDS, strict=True)])
@@ -70,7 +75,7 @@ def test_the_way_back_is_stated(ct_and_organ, shift, words):
         {"spacing": (0.8, 0.8, 5.0)},
         {"spacing": (3.0, 3.0, 3.0)},
         {"direction": "RAS"},
-        {"direction": "oblique"},
+        {"direction": "turned", "spacing": (1.0, 1.4, 2.8)},
     ],
 )
 def test_the_shift_is_found_and_none_where_there_is_none(how):
@@ -98,7 +103,7 @@ def test_readers_who_draw_inside_or_outside_the_edge_give_no_warning(ct_and_orga
 def test_a_shift_of_less_than_half_a_slice_is_within_it(thick, shift, lines):
     ct, organ = thick
     grid = VoxelGrid.of(ct)
-    shifted = replace(grid, origin=grid.origin + shift)
+    shifted = replace(grid, origin=grid.origin + TURNED @ shift)
     assert np.linalg.norm(best_shift(grid, sitk.GetArrayFromImage(ct), shifted, organ)) > LEAST_MM
     assert len(warned(ct, shifted, organ)) == lines
 

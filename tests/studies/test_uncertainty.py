@@ -107,22 +107,36 @@ def test_an_outcome_depends_on_its_values_alone_here_and_on_a_cluster(problem, c
 
 
 def test_bands_and_indices_are_those_of_a_known_function():
-    """y = a + 4 b + 0 c over uniform parameters: variances as 1 to 16 to 0, and additive."""
+    """y = a + 4 b + 0 c over uniform parameters where the press is deepest, and 2 a + 0 b + c before: additive variances."""
     unknowns = [Unknown(name, "", 0.0, 0.5, 1.0, is_ratio=False) for name in "abc"]
     values = samples_of(unknowns, 256)
     assert len(values) == count_of(unknowns, 256) == 256 * 5
-    y = np.array([each["a"] + 4 * each["b"] for each in values])
-    outcomes = np.full((len(y), 2, len(QUANTITIES) + 3), np.nan)
-    outcomes[:, :, 0] = y[:, None] * [0.5, 1.0]
+    outcomes = np.full((len(values), 2, len(QUANTITIES) + 3), np.nan)
+    outcomes[:, 0, 3] = [2 * each["a"] + each["c"] for each in values]
+    outcomes[:, 1, 3] = [each["a"] + 4 * each["b"] for each in values]
     total = indices_of(unknowns, outcomes)
-    assert list(total) == [QUANTITIES[0]]
-    found = [total[QUANTITIES[0]][name]["total"] for name in "abc"]
+    assert list(total) == [QUANTITIES[3]]
+    found = [total[QUANTITIES[3]][name]["total"] for name in "abc"]
     assert found == pytest.approx([1 / 17, 16 / 17, 0.0], abs=0.02)
-    shallow, deep = (row[QUANTITIES[0]] for row in bands_of(outcomes))
+    shallow, deep = (row[QUANTITIES[3]] for row in bands_of(outcomes))
     # b's own percentiles 5, 50 and 95, to what a varies.
     assert (deep["low"], deep["median"], deep["high"]) == pytest.approx((0.7, 2.5, 4.3), abs=0.1)
-    assert shallow["median"] == pytest.approx(deep["median"] / 2, abs=1e-3)
+    # A trapezium over 0 to 3: its first and last twentieths are triangles of the height x / 2.
+    assert (shallow["low"], shallow["median"], shallow["high"]) == pytest.approx(
+        (0.2**0.5, 1.5, 3 - 0.2**0.5), abs=0.05
+    )
     assert POSITION not in bands_of(outcomes)[0]
+
+
+def test_the_band_of_the_position_is_the_distance_from_the_median_place():
+    """Places u^2 along a line of 10 mm, u evenly in 0 to 1: their median is at a quarter, their mean at a third."""
+    u, along = np.linspace(0, 1, 20_001), 10 * np.array([2.0, -1.0, 2.0]) / 3
+    outcomes = np.zeros((len(u), 1, len(QUANTITIES) + 3))
+    outcomes[:, 0, len(QUANTITIES) :] = (u**2)[:, None] * along + [3.0, 40.0, -7.0]
+    # |u^2 - 1/4| < d: sqrt(1/4 + d) - sqrt(1/4 - d) of all, and beyond a quarter, sqrt(1/4 + d).
+    expected = dict(low=np.sqrt(1 / 16 - 0.24875**2), median=np.sqrt(1 / 16 - 0.125**2), high=0.95**2 - 0.25)
+    found = bands_of(outcomes)[0][POSITION]
+    assert found == pytest.approx({name: 10 * d for name, d in expected.items()}, abs=2e-3)
 
 
 def test_the_command_reports_writes_and_is_read_again(tmp_path, monkeypatch, capsys):
