@@ -1,5 +1,6 @@
 """The figures of cuts by planes and balls, whose margins, areas and volumes have closed forms."""
 
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,8 @@ from cut_ball import R, ball, cap_mm3, circle, cut_by, half_space, inset
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
+from rehearsal.commands.plan_command import table_of
+from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.judgement import (
     FACE_MM,
     LEAST_OPENED_MM2,
@@ -24,8 +27,16 @@ from rehearsal.resection.judgement import (
     judge,
     shown,
 )
-from rehearsal.resection.proposal import cost_ml, cost_terms
-from rehearsal.resection.resection_page import CAPSULE, COLOURS, _axes, _colours, _draw_histogram, rows_of
+from rehearsal.resection.proposal import cost_ml, cost_terms, why_first
+from rehearsal.resection.resection_page import (
+    CAPSULE,
+    COLOURS,
+    _axes,
+    _colours,
+    _draw_histogram,
+    figures_of,
+    rows_of,
+)
 from rehearsal.resection.score_line import ScoreLine
 from scenes.anatomy import Grid
 
@@ -285,6 +296,35 @@ def test_the_cost_of_a_cut_by_hand():
     assert found == pytest.approx(expected) and 0.14 * np.pi / 4 * 9 == pytest.approx(1, abs=0.02)
     assert cost_ml(by_hand(), 4.0) == pytest.approx(sum(expected.values()))
     assert cost_terms(by_hand(), 0.0)["missing margin"] == 0
+
+
+def proposed(technique: str, cost_ml: float, **changed) -> SimpleNamespace:
+    settings = CutSettings(technique, 4.0)
+    return SimpleNamespace(settings=settings, cost_ml=cost_ml, judgement=by_hand(**changed))
+
+
+def test_proposals_are_compared_by_their_figures():
+    first = proposed("enucleoresection", 30.25)
+    second = proposed(
+        "wedge", 33.5, parenchyma_removed_ml=16.5, collecting_system_opened_mm2=None, vessels=None
+    )
+    assert [re.split("  +", line.strip()) for line in table_of([first, second]).splitlines()[2:]] == [
+        ["enucleoresection", "30.2", "0.0", "13.2", "12.6", "3"],
+        ["wedge", "33.5", "0.0", "16.5", "not labelled", "not labelled"],
+    ]
+    assert why_first([first, second]) == (
+        "The first, enucleoresection, costs 3.2 points less than the next: parenchyma 13.2 points instead of 16.5, "
+        "collecting system 0.1 points instead of 0.0, vessels 8.6 points instead of 0.0."
+    )
+
+
+def test_the_reports_distance_of_the_score_is_the_least():
+    """Of points 3 and 5 mm beside a cube of 10 mm."""
+    line = SimpleNamespace(frame=lambda: np.eye(3), points=np.array([[8.0, 0, 9], [8, 9, 9]]))
+    cut = SimpleNamespace(line=line, settings=CutSettings("wedge", 4.0, 12.0, "air"))
+    how = dict(technique="wedge", margin_asked_mm=4.0, depth_mm=12.0, filling="air")
+    seen = dict(tumour_seen_percent=81.6, score_to_tumour_mm=3.0)
+    assert figures_of(cut, by_hand(), trimesh.creation.box([10.0] * 3), 81.6) == how | seen | REPORT
 
 
 def test_the_page_writes_the_figures_of_the_report():

@@ -1,5 +1,7 @@
 """The score on a ball, where shortest paths are great circles, and what is refused."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import trimesh
@@ -8,9 +10,11 @@ from cut_ball import ANGLE, MARKS, R, ball, circle, inset
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.operation import _nearest_to_probe
 from rehearsal.resection.proposal import marks_around
 from rehearsal.resection.resection_state import MOST_MARKS, NO_RESECTION, CutRequest
+from rehearsal.resection.resection_view import ResectionView
 from rehearsal.resection.score_line import (
     SPACING_MM,
     ResectionError,
@@ -157,6 +161,23 @@ def test_a_mark_of_the_image_is_on_the_capsule_nearest_to_the_probe(across_mm):
     assert found == pytest.approx((across_mm, middle[1] + roots.min()), abs=1e-3)
     with pytest.raises(ResectionError, match="ends before the edge"):
         _nearest_to_probe(np.stack([points[:-1], points[1:]], axis=1), 30.0)
+
+
+def test_the_status_of_a_score_says_how_near_and_how_much_was_seen():
+    """A point that is half a millimetre nearer than the margin is not near."""
+    marks = np.zeros((7, 3))
+    score = SimpleNamespace(length_mm=81.6)
+    state = SimpleNamespace(marks=marks.tolist())
+    rehearsal = SimpleNamespace(
+        resection=state, cut=None, score=score, score_points=lambda: (np.zeros((3, 3)), marks)
+    )
+    view = ResectionView(rehearsal)
+    view.tumour_mm, view.seen_share = np.array([4.6, 3.27, 9.0]), 0.63
+    assert view.status(CutSettings("wedge", 5.0)) == (
+        "tumour surface seen 63 %   red: 3.3 of 5 mm margin   SCORE 7 marks 82 mm   wedge"
+    )
+    assert view.score(5.0).is_near.tolist() == [False, True, False]
+    assert view.status(CutSettings("enucleation", 3.5, 12.0)) == "SCORE 7 marks 82 mm   enucleation"
 
 
 def test_marks_are_added_until_there_are_too_many_or_a_cut():

@@ -1,6 +1,7 @@
 """The study of uncertainty: what is varied, its bands and indices against a known function, and the panel's bands."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -114,10 +115,14 @@ def test_bands_and_indices_are_those_of_a_known_function():
     outcomes = np.full((len(values), 2, len(QUANTITIES) + 3), np.nan)
     outcomes[:, 0, 3] = [2 * each["a"] + each["c"] for each in values]
     outcomes[:, 1, 3] = [each["a"] + 4 * each["b"] for each in values]
+    # Variances of 4 / 12, and of 12^2 / 12^2 together: their first-order indices would be 0.
+    outcomes[:, :, 4] = [[2 * each["a"] + 12 * (each["b"] - 0.5) * (each["c"] - 0.5)] * 2 for each in values]
     total = indices_of(unknowns, outcomes)
-    assert list(total) == [QUANTITIES[3]]
-    found = [total[QUANTITIES[3]][name]["total"] for name in "abc"]
-    assert found == pytest.approx([1 / 17, 16 / 17, 0.0], abs=0.02)
+    assert list(total) == [QUANTITIES[3], QUANTITIES[4]]
+    for quantity, indices in ((3, [1 / 17, 16 / 17, 0.0]), (4, [0.25, 0.75, 0.75])):
+        found = [total[QUANTITIES[quantity]][name]["total"] for name in "abc"]
+        # The confidence of 256 base samples, of indices near 1 more than near 0.
+        assert found == pytest.approx(indices, abs=0.02 if quantity == 3 else 0.12)
     shallow, deep = (row[QUANTITIES[3]] for row in bands_of(outcomes))
     # b's own percentiles 5, 50 and 95, to what a varies.
     assert (deep["low"], deep["median"], deep["high"]) == pytest.approx((0.7, 2.5, 4.3), abs=0.1)
@@ -161,7 +166,7 @@ def test_the_command_reports_writes_and_is_read_again(tmp_path, monkeypatch, cap
     out = tmp_path / "out"
     assert app.main(["study", "uncertainty", "--samples", "8", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert "tumour modulus" in printed and "force on the probe" in printed and "Varied:" in printed
+    assert "tumour modulus" in printed and "At 6 mm, over 72 presses:" in printed
     report = json.loads((out / "uncertainty.json").read_text())
     total = report["sobol_total"]["force_n"]
     assert max(total, key=lambda name: total[name]["total"]) == "tumour modulus"
@@ -170,6 +175,29 @@ def test_the_command_reports_writes_and_is_read_again(tmp_path, monkeypatch, cap
     assert bands.indentations_mm == [2.0, 4.0, 6.0]
     assert app.main(["study", "uncertainty", "--samples", "12", "--out", str(out)]) == 2
     assert "expected a power of two" in capsys.readouterr().err
+
+
+def test_the_table_is_of_the_deepest_press_and_ranks_what_it_depends_on():
+    def band(low: float) -> dict[str, float]:
+        return dict(low=low, median=low + 1, high=low + 3)
+
+    def index(total: float) -> dict[str, float]:
+        return dict(total=total, confidence=0.01)
+
+    report = dict(
+        indentations_mm=[2.0, 6.0],
+        samples=72,
+        parameters=[dict(name="fat", unit="kPa/mm", low=0.1, typical=0.2, high=0.4)],
+        bands=[{"force_n": band(1.0)}, {"force_n": band(2.0), "margin_mm": band(-4.0)}],
+        sobol_total={"force_n": {"fat": index(0.12), "capsule": index(0.8), "friction": index(0.3)}},
+    )
+    lines = [re.split("  +", line.strip()) for line in uncertainty_command.table(report).splitlines()]
+    assert lines[0] == ["At 6 mm, over 72 presses:"]
+    assert lines[2:4] == [
+        ["force on the probe, N", "2.00", "3.00", "5.00", "capsule", "0.80", "friction", "0.30"],
+        ["margin in the image, mm", "-4.00", "-3.00", "-1.00"],
+    ]
+    assert lines[-1] == ["fat", "0.1 to 0.4 kPa/mm"]
 
 
 def bands(**changes) -> UncertaintyBands:
