@@ -9,6 +9,7 @@ import SimpleITK as sitk
 from scipy.spatial.transform import Rotation
 from synthetic_body import BODY, DIRECTIONS, LEFT, TUMOUR, drawn, grid_around, level, points_of, with_voxels
 
+from scenes.patients.import_warnings import fat_warnings
 from scenes.patients.label_shift import LATTICE_MM, LEAST_MM, best_shift, shift_warnings
 from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_maps import box_of
@@ -114,6 +115,23 @@ def test_no_shift_is_stated_where_the_fit_is_beyond_reach(ct_and_organ, shift):
     ct, organ = ct_and_organ
     grid = VoxelGrid.of(ct)
     assert warned(ct, replace(grid, origin=grid.origin + shift), organ) == ()
+
+
+@pytest.mark.parametrize("side", [0, 1, 2])
+def test_the_share_of_fat_is_that_of_a_shell_of_4_mm(side):
+    """A cuboid of 32 x 40 x 48 mm has 30.7 ml within 4 mm of its faces; with 3 or 4 mm of fat on one side of it."""
+    spacing, size_mm = np.array([1.0, 2.0, 4.0]), np.array([32.0, 40.0, 48.0])
+    count = np.rint(size_mm / spacing).astype(int)
+    organ = np.pad(np.ones(count[::-1], bool), 3)
+    hounsfield = np.full(organ.shape, 120.0)
+    layers = (3, 2, 1)[side]
+    np.moveaxis(hounsfield, 2 - side, 0)[3 : 3 + layers] = -100.0
+    grid = VoxelGrid(organ.shape[::-1], spacing, np.array([40.0, -7.0, 900.0]), TURNED)
+    (warning,) = fat_warnings(grid, hounsfield, organ, organ, 4.0)
+    fat = layers * spacing[side] * size_mm.prod() / size_mm[side]
+    assert warning.startswith(
+        f"{fat / (size_mm.prod() - (size_mm - 8).prod()):.0%} of the organ's rim is fat"
+    )
 
 
 @pytest.mark.parametrize(

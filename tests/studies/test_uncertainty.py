@@ -1,5 +1,6 @@
 """The study of uncertainty: what is varied, its bands and indices against a known function, and the panel's bands."""
 
+import csv
 import json
 import re
 
@@ -146,7 +147,7 @@ def test_the_band_of_the_position_is_the_distance_from_the_median_place():
 
 def test_the_command_reports_writes_and_is_read_again(tmp_path, monkeypatch, capsys):
     def known(problem: PressProblem, values: dict[str, float]) -> np.ndarray:
-        row = np.array([1.0, 2.0, 3.0, 4.0, values["tumour modulus"] / 10, 6.0, 0.0, 0.0, 0.0])
+        row = np.array([1.0, 2.0, 3.0, 4.0, values["tumour modulus"] / 10, 6.0, 7.0, 8.0, 9.0])
         return np.stack([row / 2, row, row * 2])
 
     class Here:
@@ -168,9 +169,18 @@ def test_the_command_reports_writes_and_is_read_again(tmp_path, monkeypatch, cap
     printed = capsys.readouterr().out
     assert "tumour modulus" in printed and "At 6 mm, over 72 presses:" in printed
     report = json.loads((out / "uncertainty.json").read_text())
+    rows = list(csv.DictReader((out / "uncertainty.csv").read_text().splitlines()))
     total = report["sobol_total"]["force_n"]
     assert max(total, key=lambda name: total[name]["total"]) == "tumour modulus"
-    assert (out / "uncertainty.png").stat().st_size > 10_000 and (out / "uncertainty.csv").is_file()
+    assert (out / "uncertainty.png").stat().st_size > 10_000 and len(rows) == 72
+    deepest = dict(
+        tumour_shift_mm=2.0, to_tumour_mm=4.0, tumour_depth_mm=6.0, margin_mm=8.0, compression_mm=12.0
+    )
+    deepest |= dict(
+        force_n=float(rows[0]["tumour modulus"]) / 5, tumour_x_mm=14.0, tumour_y_mm=16.0, tumour_z_mm=18.0
+    )
+    found = {name: float(rows[0][f"{name} (deepest)"]) for name in deepest}
+    assert found == pytest.approx(deepest)
     bands = read_bands(out / "uncertainty.json")
     assert bands.indentations_mm == [2.0, 4.0, 6.0]
     assert app.main(["study", "uncertainty", "--samples", "12", "--out", str(out)]) == 2
