@@ -57,6 +57,10 @@ def test_figures_are_those_of_tissue_that_is_there(one_device, lost):
     assert report["force_max_n"] == (0.5 if lost is None else None)
     assert report["probe_force_n"] == ([0.0, 0.15, -0.2] if lost is None else None)
     assert report["probe_torque_n_mm"] == ([1.0, 2.0, 3.0] if lost is None else None)
+    # The first of each compiles kernels.
+    tally.step_ms, tally.slice_ms = [900.0, 4.0, 5.5, 70.0], [800.0, 7.25]
+    speed = "5.5 ms per step, 7.2 ms per image (medians of 2) on cpu; built in 1.0 s"
+    assert f"speed     {speed}" in summary(tally.report(rehearsal, "cpu"))
     assert "parts     tumour 60 kPa (nu 0.4)" in summary(report)
     (press,) = (line for line in summary(report).splitlines() if line.startswith("press"))
     figures = "indentation 3.50 mm at most, force 0.50 N at most; least volume 97.0 %; penetration at most 0.250 mm; all finite"
