@@ -250,6 +250,17 @@ def test_colour_begins_at_an_energy_that_falls_as_its_gain_rises(vessel, gain, t
     assert shown[0] < 0.02 and shown[1] > 0.9
 
 
+def test_velocities_within_the_wall_filter_have_no_colour(vessel):
+    """Noise alone has any phase: of a filter of 15 cm/s and a limit of 60, a quarter is not shown, though all of it is above the threshold."""
+    vessel.tank.fill()
+    vessel.set_flow([0.0, 0.0, 0.0], amplitude=0.0)
+    probe = probe_of(**SETTINGS | dict(noise_db=-90.0, colour_gain_percent=100.0, wall_filter_cm_s=15.0))
+    vessel.tank.look(probe, "speckle")
+    image = vessel.straight.render(probe, np.zeros((256, 256), np.uint8), "colour", SYSTOLE_S)
+    # Three standard errors of some 500 independent samples.
+    assert (image[40:200, 40:200] > 0).any(axis=-1).mean() == pytest.approx(0.75, abs=0.06)
+
+
 @pytest.mark.parametrize(
     "mode, stops, share, velocity_cm_s, above_db",
     [
@@ -278,6 +289,8 @@ def test_a_colour_is_the_share_of_its_scale(vessel, mode, stops, share, velocity
 def test_the_error_of_an_estimate_is_that_of_ten_pulses(vessel):
     """Kasai's estimate of N pulses: the autocorrelation has a relative error of 1 / sqrt(N), half of it across its phase."""
     probe = probe_of(**SETTINGS | {"noise_db": -105.0})
+    # 6 dB less in the narrower band, and 10 dB less in the mean of ten pulses.
+    assert 10 * np.log10(noise_energy(probe)) == pytest.approx(-105.0 - 6.0 - 10.0)
     vessel.tank.fill()
     vessel.set_flow([0.0, -0.3, 0.0])
     found = vessel.look(probe)
