@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import rotation_about
-from cut_ball import ANGLE, MARKS, R, ball, circle, inset
+from cut_ball import ANGLE, R, ball, circle, inset
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -219,7 +219,3 @@ def test_beside_the_organ_the_line_is_at_its_nearest_place_with_the_margin():
     # Some 14 mm from the middle: the vertices of the organ are 2 mm apart.
     away = np.linalg.norm(marks - middle, axis=1)
     assert away.min() > 8.0 + 5.0 and (away < 8.0 + 5.5 + 2.0).sum() > 3
-
-
-def test_there_are_enough_marks_for_the_circle():
-    assert len(circle()) == MARKS

@@ -1,16 +1,13 @@
-"""Parts near an organ, and their surfaces made in processes of their own: the same as here, and the same errors."""
+"""Surfaces of parts made in processes of their own: the same as here, and the same errors."""
 
 import os
 
 import numpy as np
 import pytest
-from conftest import rotation_about
 
 from errors import PatientError
 from scenes.patients import part_surfaces
-from scenes.patients.organ_selection import find_organs
-from scenes.patients.part_surfaces import near_organ, part_surfaces_in_processes
-from scenes.patients.readers.label_maps import LabelMap
+from scenes.patients.part_surfaces import part_surfaces_in_processes
 from scenes.terminal import silent
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -43,22 +40,6 @@ def test_they_are_the_same_wherever_they_are_made(monkeypatch):
         assert np.array_equal(surface.vertices, there[tissue].vertices)
         assert np.array_equal(surface.faces, there[tissue].faces)
         assert there[tissue].is_watertight and there[tissue].volume > 0
-
-
-def test_vessels_are_taken_up_to_15_mm_from_the_organ_in_thick_slices():
-    """A cuboid with a vein along each axis through its middle, in voxels of 1 x 2 x 4 mm: 15, 7 and 3 of them on each side."""
-    values = np.zeros((30, 40, 60), np.uint8)
-    values[15, 20], values[15, :, 30], values[:, 20, 30] = 2, 2, 2
-    values[12:18, 14:26, 20:40] = 1
-    turn = rotation_about([1, 2, 2], 75)
-    grid = VoxelGrid((60, 40, 30), np.array([1.0, 2.0, 4.0]), np.array([300.0, -90.0, 40.0]), turn)
-    labels = LabelMap.valued(grid, values, {1: "kidney", 2: "vein"})
-    (piece,) = find_organs(labels)
-    found, inside = near_organ(labels, piece, [2])
-    at = (found.place(np.argwhere(inside)[:, ::-1]) - grid.place([20, 14, 12])) @ turn
-    assert len(at) == 2 * (15 + 7 + 3)
-    assert at.min(axis=0) == pytest.approx([-15, -14, -12])
-    assert at.max(axis=0) == pytest.approx([19 + 15, 22 + 14, 20 + 12])
 
 
 @pytest.mark.parametrize("aside", [False, True])
