@@ -23,6 +23,7 @@ from rehearsal.resection.judgement import (
     MarginMap,
     diameter_of_section,
     divided_vessels,
+    drawn_mm,
     findings_of,
     judge,
     shown,
@@ -351,12 +352,13 @@ def test_the_page_draws_the_area_of_each_margin_in_its_colour():
     axes = Figure().add_subplot()
     _draw_histogram(axes, by_hand())
     drawn = {bar.get_x(): (bar.get_height(), to_hex(bar.get_facecolor())) for bar in axes.patches}
-    areas = {-2.0: 0.1, -0.5: 0.2, 0.5: 0.3, 2.5: 0.4, 4.0: 0.5}
+    # Along the tumour's surface, which is no positive margin, it is 0.
+    areas = {-2.0: 0.1, 0.0: 0.2, 0.5: 0.3, 2.5: 0.4, 4.0: 0.5}
     assert {x: cm2 for x, (cm2, _) in drawn.items() if cm2} == pytest.approx(areas)
-    colours = [COLOURS[number] for number in (0, 0, 1, 2, 3)]
+    colours = [COLOURS[number] for number in (0, 1, 1, 2, 3)]
     assert [drawn[x][1] for x in areas] == colours
     faces = SimpleNamespace(on_specimen=np.array([True] * 5 + [False]))
-    of_faces = _colours(np.append(by_hand().margin.distance_mm, 1.0), faces)
+    of_faces = _colours(np.append(drawn_mm(by_hand().margin.distance_mm), 1.0), faces)
     assert [to_hex(colour) for colour in of_faces] == [*colours, CAPSULE]
 
 

@@ -7,7 +7,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 import SimpleITK as sitk
-from ellipsoid_kidney import ball
+from ellipsoid_kidney import HALF_AXES, ball, kidney
 from synthetic_body import LEFT, TUMOUR, body, coarsely, points_of, with_voxels
 
 from scenes.patients.check_picture import (
@@ -219,6 +219,10 @@ def test_the_summary_has_the_measures_of_the_labels(patient):
     # A voxel in each direction, and half a millimetre by rounding.
     assert np.array(extent, float) == pytest.approx([92 + 11 - 45, 40, 90], abs=3.5)
     assert float(rows["length"].split()[0]) == pytest.approx(90, abs=3.5)
+    # A tumour on a pole is not of the length: where it was, the contour ends below the pole.
+    pole = np.array([0.0, 0.0, HALF_AXES[2]]), 14.0
+    polar = replace(patient, organ=kidney(pole), parts={"tumour": ball(*pole)})
+    assert 2 * HALF_AXES[2] - 14 < polar.length_mm < 2 * HALF_AXES[2] < polar.organ.extents[2] - 10
 
 
 def test_the_complexity_of_the_tumour_is_in_the_summary(patient):
