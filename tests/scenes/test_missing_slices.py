@@ -139,6 +139,14 @@ class TestLeft:
         labels = without(thick[1], range(k - 2, k + 3))
         assert_left(labels, ORGAN)
 
+    @pytest.mark.parametrize(("width", "count"), [(3, 0), (6, 1)])
+    def test_the_end_of_a_lobe(self, width, count):
+        """A section of less than 1 cm2: 5 rows of 3 pixels of 4 mm2, in slices of 5 mm; twice as wide it is missing."""
+        values = np.zeros((20, 20, 20), np.uint8)
+        values[:, 5:10, 5 : 5 + width], values[10] = 2, 0
+        grid = VoxelGrid((20, 20, 20), np.array([2.0, 2.0, 5.0]), np.zeros(3), np.eye(3))
+        assert len(fill_missing_slices(LabelMap.valued(grid, values, NAMES), [2])[1]) == count
+
     @pytest.mark.parametrize("apart_mm", [11.0, 16.0])
     @pytest.mark.parametrize("axis", [0, 1, 2])
     def test_two_bodies_that_face_each_other(self, axis, apart_mm):
