@@ -212,7 +212,7 @@ def test_the_terms_of_a_path_are_those_of_its_poses(manipulator):
     top = pose_at(R * Z, -Z, X, SIZE[2])
     poses = np.stack([tilted(top, SIZE[2], angle) for angle in (-10.0, 20.0, 30.0, 0.0, 0.0)])
     compressions, contacts = [1.0, 5.0, 5.1, 9.0, 2.4], [0.2, 0.4, 0.9, 1.0, 0.5]
-    restored = np.array([True, False, False, True, False])
+    restored = np.array([False, True, False, True, False])
     found = Trial.terms(
         trial, [poses[:2], poses[2:]], compressions, contacts, restored, seen=0.7, path_mm=40.0, time_s=4.0
     )
