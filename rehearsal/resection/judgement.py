@@ -257,6 +257,11 @@ def _vessel_at(points: np.ndarray, labels: Grid | None, tissues: Mapping[int, st
     return max(counts, key=counts.__getitem__) if any(counts.values()) else "vessel"
 
 
+def drawn_mm(distance_mm: np.ndarray) -> np.ndarray:
+    """Distances (n,) [mm] from the tumour as a picture has them: 0 where the cut runs along its surface, which is no positive margin."""
+    return np.where((distance_mm < 0) & (distance_mm >= -SURFACE_ERROR_MM), 0.0, distance_mm)
+
+
 def shown(value: float, unit: str, digits: int = 0) -> str:
     """A figure as it is written: what is too small for the last digit is not written as zero."""
     least = 10.0**-digits

@@ -15,7 +15,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.cut import Cut
-from rehearsal.resection.judgement import MARGIN_LIMITS_MM, NOT_LABELLED, Judgement, shown
+from rehearsal.resection.judgement import MARGIN_LIMITS_MM, NOT_LABELLED, Judgement, drawn_mm, shown
 from rehearsal.resection.operation import distance_to_tumour, seen_share
 from rehearsal.resection.proposal import KEPT_WITHIN_MM
 from rehearsal.resection.resection_plan import ResectionPlan, against_plan
@@ -86,7 +86,7 @@ def draw_page(
     FigureCanvasAgg(figure)
     figure.text(0.03, 0.93, f"{title}: the specimen, coloured by its margin", fontsize=17, weight="bold")
     faces = np.asarray(cut.specimen.vertices)[np.asarray(cut.specimen.faces)]
-    colours = _colours(signed_distance_from(tumour, faces.mean(axis=1)), cut)
+    colours = _colours(drawn_mm(signed_distance_from(tumour, faces.mean(axis=1))), cut)
     for place, (name, eye, up) in enumerate(VIEWS):
         axes = figure.add_axes((0.01 + 0.3 * place, 0.14, 0.3, 0.76), projection="3d")
         seen = _axes(cut, eye, up)
@@ -148,7 +148,7 @@ def _draw_compass(axes: Axes, seen: np.ndarray) -> None:
 
 def _draw_histogram(axes: Axes, judgement: Judgement) -> None:
     """Draw the area of the resection surface by its margin."""
-    margin, area = judgement.margin.distance_mm, judgement.margin.area_mm2
+    margin, area = drawn_mm(judgement.margin.distance_mm), judgement.margin.area_mm2
     last = max(MARGIN_LIMITS_MM[-1] + 2, np.ceil(margin.max()))
     edges = np.arange(np.floor(min(margin.min(), 0.0)), last + 0.5, 0.5)
     area_of = np.histogram(margin, edges, weights=area)[0]

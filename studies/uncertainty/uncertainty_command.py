@@ -18,7 +18,7 @@ from scenes.scene import EMBEDDED
 from scenes.tissue import USUAL
 from studies.study_options import dask_option, jobs_option, out_option, scene_argument
 from studies.study_results import finish_axes, text_table, write_results
-from studies.uncertainty.press_outcomes import PressProblem, press_outcome
+from studies.uncertainty.press_outcomes import QUANTITIES, PressProblem, press_outcome
 from studies.uncertainty.sensitivity import bands_of, count_of, indices_of, samples_of
 from studies.uncertainty.unknowns import Unknown, unknowns_of, with_all_parts
 from version import VERSION
@@ -34,6 +34,8 @@ WORDS = {
     "compression_mm": "compression, mm",
     "tumour_position_mm": "tumour from its median place, mm",
 }
+# Of the tumour, from the middle of the organ at rest (LPS).
+CENTROID = ("tumour_x_mm", "tumour_y_mm", "tumour_z_mm")
 
 
 def _power_of_two(context: click.Context, parameter: click.Parameter, value: int) -> int:
@@ -109,7 +111,8 @@ def report_of(outcomes: np.ndarray, unknowns: list[Unknown], depths_mm: tuple[fl
 
 
 def _flat(outcome: np.ndarray) -> dict[str, float]:
-    return {f"{name} (deepest)": float(value) for name, value in zip(WORDS, outcome[-1], strict=False)}
+    names = *QUANTITIES, *CENTROID
+    return {f"{name} (deepest)": float(value) for name, value in zip(names, outcome[-1], strict=True)}
 
 
 def table(report: dict[str, Any]) -> str:

@@ -5,9 +5,11 @@ from contextlib import suppress
 import numpy as np
 import pytest
 import trimesh
+from conftest import rotation_about
 from cut_ball import HEIGHT_MM, MARKS, RIM_MM, R, ball, cap_mm3, circle, inset, line_on_ball
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from scipy.optimize import brentq
 
 from rehearsal.resection.cut import (
     STEEPEST,
@@ -79,6 +81,55 @@ def test_the_walls_of_a_wedge_meet_below_the_tumour_and_its_margin():
     sine = 5.0 / (deepest - 6.0)
     tangent = RIM_MM / deepest
     assert sine / np.sqrt(1 - sine**2) == pytest.approx(tangent, rel=0.05)
+
+
+# A rectangle on the top of an oblique block, off the origin: half of its length and width [mm].
+LONG, WIDE = 22.0, 12.0
+TURN, MIDDLE = rotation_about([2, -1, 3], 70), np.array([100.0, -60.0, 250.0])
+
+
+def in_block(points: np.ndarray) -> np.ndarray:
+    """Places (n, 3) from those along the block's axes, with the middle of its top at 0."""
+    return np.asarray(points) @ TURN.T + MIDDLE
+
+
+@pytest.fixture(scope="module")
+def long_line():
+    """The block, and the line on it."""
+    block = trimesh.creation.box([90.0, 60.0, 40.0]).apply_translation([4.0, -3.0, -20.0])
+    block = trimesh.Trimesh(in_block(block.vertices), block.faces, process=False)
+    corners = np.array([[LONG, WIDE, 0], [-LONG, WIDE, 0], [-LONG, -WIDE, 0], [LONG, -WIDE, 0]])
+    return block, score_line(block, in_block(corners))
+
+
+def test_a_wedge_has_a_ridge_along_a_long_line(long_line):
+    """A hipped roof: h b (3 a - b) / 6, where walls are as steep at the ends as at the sides."""
+    block, line = long_line
+    made = cut_organ(block, line, CutSettings("wedge", depth_mm=12.0), np.zeros((0, 3)))
+    a, b = 2 * LONG, 2 * WIDE
+    # The cutter is simplified by 0.05 mm on its walls of some 1500 mm2.
+    assert made.specimen.volume == pytest.approx(12.0 * b * (3 * a - b) / 6, abs=0.05 * 1500)
+
+
+@pytest.mark.parametrize("margin_mm", [0.0, 3.0])
+def test_the_walls_of_a_long_wedge_keep_the_margin_of_a_long_tumour(long_line, margin_mm):
+    """A line of points 5 mm deep: at a depth D the sides are at (D - 5) sin(angle), where tan(angle) = b / 2 D."""
+    block, line = long_line
+    tumour = np.column_stack([np.linspace(-2.0, 9.0, 23), np.zeros(23), np.full(23, -5.0)])
+    made = cut_organ(block, line, CutSettings("wedge", margin_mm), in_block(tumour))
+    local = (np.asarray(made.specimen.vertices) - MIDDLE) @ TURN
+
+    def depth(margin: float) -> float:
+        return brentq(lambda d: (d - 5.0) * WIDE / np.hypot(d, WIDE) - margin, 5.0, 60.0)
+
+    # A margin is up to 5 % wider; the cutter is simplified by 0.05 mm.
+    assert depth(margin_mm) - 0.1 < -local[:, 2].min() < depth(1.05 * margin_mm) + 0.1
+    bed = (made.resection_surface().triangles.view(np.ndarray) - MIDDLE) @ TURN
+    nearest = trimesh.triangles.closest_point(
+        np.repeat(bed, len(tumour), axis=0), np.tile(tumour, (len(bed), 1))
+    )
+    least = np.linalg.norm(nearest - np.tile(tumour, (len(bed), 1)), axis=1).min()
+    assert margin_mm - 0.1 < least < 1.05 * margin_mm + 0.1
 
 
 def test_a_wedge_is_not_steeper_than_stated():

@@ -18,6 +18,7 @@ from rehearsal import frame, headless, opening, run
 from rehearsal.asked_files import AskedFiles
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.frame import PREPARING, Frames, WindowFrames
+from rehearsal.measurements.run_report import Tally
 from rehearsal.notices import Notices
 from rehearsal.pressed_organ import Step
 from rehearsal.resection.resection_state import NO_RESECTION
@@ -339,6 +340,27 @@ def test_the_clock_is_the_sessions_and_says_where_it_is_slow(looping):
     rates.append((10.0, 0.25))
     frozen = next_view(looping, Controls(Settings(), freeze=True))
     assert (frozen.clock, frozen.pace) == ("1.0 s", "") and "time" not in frozen.readouts
+
+
+def test_the_texts_around_the_image_are_its_settings_and_times():
+    own = dict(gain_percent=63.0, dyn_range_db=72.0, frequency_mhz=9.5, velocity_scale_cm_s=18.0)
+    probe = load_probe("linear").model_copy(update=own)
+    settings = Settings(window_hu=360, level_hu=35, clamped=True, mode="both", doppler="colour")
+    b_mode = "9.5 MHz   G 63 %   DR 72 dB   speckle   hilum clamped"
+    assert frame.captions(probe, settings)[1:] == (b_mode, "W 360   L 35 HU")
+    assert frame.scale_texts(probe, settings) == ("+18", "-18")
+    model = SimpleNamespace(counts=lambda: dict(elements=9000, nodes=9999))
+    rehearsal = SimpleNamespace(model=model, indentation_mm=lambda: -2.0)
+    # Medians of the last thirty.
+    tally = Tally(0.0, step_ms=[90.0] * 40 + [4.0] * 14 + [5.0] * 2 + [99.0] * 14, slice_ms=[7.0, 8.0, 30.0])
+    shown = {"step": "5.0 ms", "image": "8.0 ms", "elements": "9000", "indentation": "0.0 mm"}
+    assert frame.readouts(rehearsal, tally) == shown
+
+
+def test_the_latency_is_the_median_of_the_last_frames(looping):
+    looping.times.latency_ms.extend([500.0] * 30 + [40.0] * 9 + [50.0] * 2 + [900.0] * 9)
+    looping.times.rates = lambda recent_s: (23.6, 1.0)
+    assert looping._speeds() == {"frames": "24 /s", "latency": "50 ms"}
 
 
 def test_without_contact_whoever_leads_by_hand_is_told_how_to_press(looping, monkeypatch):

@@ -160,6 +160,33 @@ def test_an_echo_is_said_to_be_black_where_hardly_a_line_touches(
     assert watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings()).notes == notes
 
 
+def test_the_panel_shows_each_figure_under_its_name_with_its_unit(
+    one_device, watching, rehearsal, monkeypatch
+):
+    watching.guide = None
+    shares = dict(organ=0.123, tumour=0.456, margin=0.789)
+    monkeypatch.setattr(watching.coverage, "fraction", shares.get)
+    always = {"compression": "8.3 mm", "contact": "123 mm2", "force": "0.52 N"}
+    watching.latest = Measurement(8.26, 123.4, force_n=0.517, torque_n_mm=9.9)
+    assert watching.findings() == always | {"organ seen": "12 %"}
+    watching.latest = Measurement(8.26, 123.4, 20.11, 7.27, 3.38, 0.37, -4.96, 0.517, 9.9)
+    assert watching.findings() == always | {
+        "to tumour": "20.1 mm",
+        "tumour depth": "7.3 mm",
+        "tumour shift": "3.4 mm",
+        "in view": "37 %",
+        "margin": "-5.0 mm",
+        "tumour volume seen": "46 %",
+        "+8 mm seen": "79 %",
+    }
+    shown = watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings())
+    assert (shown.alert, shown.status) == ("compression", "TISSUE COMPRESSED BY 8 mm")
+    # The scene's limit is 8 mm.
+    watching.latest = Measurement(8.0, 123.4)
+    shown = watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings())
+    assert (shown.alert, shown.status) == ("", "")
+
+
 @pytest.mark.parametrize(
     ("in_view", "margin", "shown"),
     [(0.5, -0.04, "0.0 mm"), (0.5, 0.0, "0.0 mm"), (0.5, -0.06, "-0.1 mm"), (0.0, 1.0, ""), (None, None, "")],

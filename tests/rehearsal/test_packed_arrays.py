@@ -100,14 +100,16 @@ def test_a_course_counts_presses_ways_and_time_over_the_limit():
         course.add(None if at_mm is None else pose, 0.0, STEP_S)
     # 5 mm, 1 mm, a way back, whose leap is no way of the transducer, 2 mm.
     assert (course.path_mm, course.fastest_mm_s, course.went_back) == (8.0, 5.0 / STEP_S, 1)
-    figures = course.summary({"seen_organ": 0.25, "contact_mm2": 3.0}, [Gap(1.5, 2.0)], 4)
+    figures = course.summary({"seen_organ": 0.25, "contact_mm2": 3.0}, [Gap(1.5, 2.0), Gap(0.4, 3.0)], 4)
     assert (figures["duration_s"], figures["bookmarks"], figures["seen_organ"]) == (2.0, 4, 0.25)
-    assert "contact_mm2" not in figures and "2 presses" in summary_text(figures)
-    assert "2.25 N at most on the probe" in summary_text(figures)
-
-    assert "4 bookmarks" in summary_text(
-        figures
-    ) and "largest region not imaged is 1.5 ml, up to 2.0 mm thick" in summary_text(figures)
+    assert "contact_mm2" not in figures
+    # Of 16 steps of 1/8 s, in two the limit was exceeded.
+    assert summary_text(figures).splitlines() == [
+        "session     2.0 s, 2 presses, the path of the transducer 8 mm, at most 40 mm/s; 4 bookmarks",
+        "compression 9.0 mm at most, also by the organ's own weight; 0.2 s above the limit of 8 mm",
+        "force       2.25 N at most on the probe",
+        "coverage    of the volume: organ 25 %; the largest region not imaged is 1.5 ml, up to 2.0 mm thick",
+    ]
     said = summary_text(figures | dict(presses=1, bookmarks=1))
     # Shape matching has no forces.
     without = SessionCourse(8.0)

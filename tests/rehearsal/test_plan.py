@@ -1,7 +1,8 @@
 """The geometry of plans, on a ball: paths, layouts, reach and scores."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import pairwise, product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -45,6 +46,7 @@ from rehearsal.planning.sweep_score import (
     score,
     why_better,
 )
+from rehearsal.planning.sweep_trial import Trial
 from scenes.scene import Trocar
 from ultrasound.probe_manipulator import ProbeManipulator, advanced, pose_at, poses_between, rigid
 
@@ -200,6 +202,24 @@ def test_incidence_is_the_mean_angle_to_the_surface(manipulator):
     top = pose_at(R * Z, -Z, X, SIZE[2])
     poses = np.stack([tilted(top, SIZE[2], angle) for angle in (-10.0, 20.0, 30.0)])
     assert incidence_deg(manipulator, poses) == pytest.approx(20.0, abs=NORMAL_DEG)
+
+
+def test_the_terms_of_a_path_are_those_of_its_poses(manipulator):
+    """Over its limit of 5 mm in two of five poses, and restored in one of these and another; one of three holds is not possible."""
+    transducer = SimpleNamespace(compression_warning_mm=5.0)
+    rehearsal = SimpleNamespace(scene=SimpleNamespace(transducer=transducer), manipulator=manipulator)
+    trial = SimpleNamespace(rehearsal=rehearsal, held=lambda passes: np.array([True, False, True]))
+    top = pose_at(R * Z, -Z, X, SIZE[2])
+    poses = np.stack([tilted(top, SIZE[2], angle) for angle in (-10.0, 20.0, 30.0, 0.0, 0.0)])
+    compressions, contacts = [1.0, 5.0, 5.1, 9.0, 2.4], [0.2, 0.4, 0.9, 1.0, 0.5]
+    restored = np.array([False, True, False, True, False])
+    found = Trial.terms(
+        trial, [poses[:2], poses[2:]], compressions, contacts, restored, seen=0.7, path_mm=40.0, time_s=4.0
+    )
+    expected = ScoreTerms(0.7, 4.5, 9.0, 0.6, 0.6, 12.0, 40.0, 4.0, 2 / 3)
+    assert asdict(found) == pytest.approx(asdict(expected), abs=NORMAL_DEG) and found.incidence_deg > 11
+    figures = {name: value for name, value in asdict(found).items() if name != "incidence_deg"}
+    assert figures == pytest.approx({name: asdict(expected)[name] for name in figures})
 
 
 # Reach

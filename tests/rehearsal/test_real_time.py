@@ -392,6 +392,24 @@ def test_single_long_steps_change_nothing():
     assert pace.level == 0
 
 
+# Times longer than a sixtieth of a second, and shares of the iterations, of each level.
+LEVELS = [(1, 1.0), (2, 1.0), (3, 1.0), (4, 1.0), (4, 0.75), (4, 0.5), (4, 0.25)]
+
+
+@pytest.mark.parametrize("load", [0.4, 0.6, 0.69, 0.95, 1.2, 1.45, 1.9, 2.3, 2.6, 2.75, 3.6, 4.2, 7.0, 20.0])
+def test_a_machine_of_one_speed_goes_to_one_level_and_stays(load):
+    """A step takes as long as its iterations; of five, one is half as long again, and one takes hardly any time."""
+    pace, levels = Pace(1 / 60), [0]
+    for number in range(12 * STEPS_UP):
+        unsteady = (1.0, 1.0, 1.5, 0.1, 1.0)[number % 5]
+        pace.watch(unsteady * load * pace.iterations(8) / 8 * 1000 / 60, pace.length_s)
+        levels.append(pace.level)
+    # The first at which a step takes at most half of the time that it simulates, else the last.
+    enough = [n for n, (longer, share) in enumerate(LEVELS) if load * share <= 0.5 * longer]
+    assert np.unique(levels).tolist() == list(range(min(enough, default=6) + 1))
+    assert (np.diff(levels) >= 0).all()
+
+
 def test_steps_are_at_most_a_fifteenth_of_a_second_unless_the_scenes_are_longer():
     assert max(level.times_longer for level in Pace(1 / 60).levels) == 4
     assert max(level.times_longer for level in Pace(1 / 1000).levels) == 64

@@ -1,15 +1,20 @@
 """The score on a ball, where shortest paths are great circles, and what is refused."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import trimesh
 from conftest import rotation_about
-from cut_ball import ANGLE, MARKS, R, ball, circle, inset
+from cut_ball import ANGLE, R, ball, circle, inset
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rehearsal.resection.cut import CutSettings
+from rehearsal.resection.operation import _nearest_to_probe
 from rehearsal.resection.proposal import marks_around
 from rehearsal.resection.resection_state import MOST_MARKS, NO_RESECTION, CutRequest
+from rehearsal.resection.resection_view import ResectionView
 from rehearsal.resection.score_line import (
     SPACING_MM,
     ResectionError,
@@ -141,6 +146,40 @@ def test_the_order_of_the_marks_keeps_a_bent_outline_from_crossing_itself():
     assert not crosses_itself(score_line(plate, set_marks).marks[:, :2])
 
 
+@pytest.mark.parametrize("across_mm", [-9.0, 3.0, 14.0])
+def test_a_mark_of_the_image_is_on_the_capsule_nearest_to_the_probe(across_mm):
+    """A section like an oblique ellipse: of both places at a lateral position, the shallower one."""
+    half, turn, middle = np.array([20.0, 12.0]), rotation_about([0, 0, 1], 25)[:2, :2], np.array([3.0, 24.0])
+    angle = np.linspace(0, 2 * np.pi, 1001)
+    points = half * np.column_stack([np.cos(angle), np.sin(angle)]) @ turn.T + middle
+    found = _nearest_to_probe(np.stack([points[:-1], points[1:]], axis=1), across_mm)
+    # x' A x = 1, with x from the middle: a quadratic equation in the depth.
+    form = turn @ np.diag(half**-2.0) @ turn.T
+    aside = across_mm - middle[0]
+    roots = np.roots([form[1, 1], 2 * form[0, 1] * aside, form[0, 0] * aside**2 - 1])
+    # Chords of 0.1 mm are inside the ellipse by less than 0.001 mm.
+    assert found == pytest.approx((across_mm, middle[1] + roots.min()), abs=1e-3)
+    with pytest.raises(ResectionError, match="ends before the edge"):
+        _nearest_to_probe(np.stack([points[:-1], points[1:]], axis=1), 30.0)
+
+
+def test_the_status_of_a_score_says_how_near_and_how_much_was_seen():
+    """A point that is half a millimetre nearer than the margin is not near."""
+    marks = np.zeros((7, 3))
+    score = SimpleNamespace(length_mm=81.6)
+    state = SimpleNamespace(marks=marks.tolist())
+    rehearsal = SimpleNamespace(
+        resection=state, cut=None, score=score, score_points=lambda: (np.zeros((3, 3)), marks)
+    )
+    view = ResectionView(rehearsal)
+    view.tumour_mm, view.seen_share = np.array([4.6, 3.27, 9.0]), 0.63
+    assert view.status(CutSettings("wedge", 5.0)) == (
+        "tumour surface seen 63 %   red: 3.3 of 5 mm margin   SCORE 7 marks 82 mm   wedge"
+    )
+    assert view.score(5.0).is_near.tolist() == [False, True, False]
+    assert view.status(CutSettings("enucleation", 3.5, 12.0)) == "SCORE 7 marks 82 mm   enucleation"
+
+
 def test_marks_are_added_until_there_are_too_many_or_a_cut():
     marked = NO_RESECTION.with_marks(circle(5)).with_marks(circle(3))
     assert marked.points().shape == (8, 3) and NO_RESECTION.marks == ()
@@ -180,7 +219,3 @@ def test_beside_the_organ_the_line_is_at_its_nearest_place_with_the_margin():
     # Some 14 mm from the middle: the vertices of the organ are 2 mm apart.
     away = np.linalg.norm(marks - middle, axis=1)
     assert away.min() > 8.0 + 5.0 and (away < 8.0 + 5.5 + 2.0).sum() > 3
-
-
-def test_there_are_enough_marks_for_the_circle():
-    assert len(circle()) == MARKS

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from PIL import Image, ImageDraw
 
 from render import background_image, ultrasound_panel
 from render.text import font
@@ -46,6 +47,21 @@ def test_picture_box_has_the_shape_of_the_image_plane_and_stays_in_the_panel(wid
     assert box.top >= HEADER_HEIGHT and box.bottom <= LAYOUT.panel.bottom
     # Each side is rounded to whole pixels: half a pixel on either.
     assert abs(box.width * depth_mm - box.height * width_mm) <= 0.5 * (width_mm + depth_mm)
+
+
+def test_the_panel_writes_the_depth_below_the_face_and_the_ends_of_the_scale():
+    """An image of 130 mm begins 10 mm behind the middle of a curved face."""
+    written: dict[str, float] = {}
+    draw = ImageDraw.Draw(Image.new("RGB", (1280, 720)))
+    draw.text = lambda at, text, **_: written.update({text: at[1]})
+    view = ct_view(60.0, 130.0, above_mm=10.0, captions=("probe", "", ""), scale=("+18", "-18"))
+    ultrasound_panel.draw_panel(draw, LAYOUT, view)
+    assert "Depth 12.0 cm" in written and written["+18"] < written["-18"]
+    # The ruler begins at the face.
+    box = LAYOUT.image_boxes(1, 60.0, 130.0)[0]
+    per_cm = 10 * box.height / 130
+    assert written["cm"] == pytest.approx(box.top + per_cm, abs=1)
+    assert written["12"] == pytest.approx(box.bottom, abs=1) and "13" not in written
 
 
 def test_image_plane_without_extent_is_refused():

@@ -95,9 +95,10 @@ class TestBedOfFile:
         for name, mesh in (("inside", inside), ("far", far), ("open", open_)):
             mesh.export(tmp_path / f"{name}.stl")
         (tmp_path / "text.stl").write_text("no surface")
+        # Where x and y of the ellipsoid are equal, 15.6 mm, its surface is 4.4 mm inside the cube's; the other's face is at x = -280 mm.
         for name, words in [
-            ("inside", "mm into the organ"),
-            ("far", "mm from the organ"),
+            ("inside", r"reaches [45]\.\d mm into the organ"),
+            ("far", r"is 32[3-7] mm from the organ"),
             ("open", "not a closed surface"),
             ("text", "has no triangles"),
             ("absent", "no such file"),

@@ -1,11 +1,13 @@
 """The checking picture shows what was imported where it is, the way up that its letters say."""
 
+import re
 from dataclasses import replace
 
 import matplotlib.image
 import numpy as np
 import pytest
-from ellipsoid_kidney import ball
+import SimpleITK as sitk
+from ellipsoid_kidney import HALF_AXES, ball, kidney
 from synthetic_body import LEFT, TUMOUR, body, coarsely, points_of, with_voxels
 
 from scenes.patients.check_picture import (
@@ -203,6 +205,24 @@ def test_long_text_ends_above_the_names_of_the_colours(patient, tmp_path):
     # The first name is 370 pixels below the middle of the picture.
     assert white[0].max() < 368 and white[1].max() < 368
     assert len(white[0]) > len(white[1])
+
+
+def test_the_summary_has_the_measures_of_the_labels(patient):
+    """An ellipsoid of half axes 25, 20 and 45 mm, and a ball of 11 mm that goes 8 mm beyond it to the left."""
+    values = sitk.GetArrayFromImage(body(spacing=(3.0, 3.0, 3.0))[1])
+    volumes = dict(organ=np.isin(values, [2, 3]).sum() * 0.027, tumour=(values == 3).sum() * 0.027)
+    assert patient.volumes_ml == pytest.approx(volumes)
+    rows = dict(summary_rows(replace(patient, volumes_ml=dict(organ=151.64, tumour=8.24))))
+    assert rows["organ"] == f"left kidney, 151.6 ml (surface {patient.organ.volume / 1000:.1f})"
+    assert rows["tumour"] == f"8.2 ml, {len(patient.tumour.faces)} faces"
+    extent = re.fullmatch(r"(\d+) x (\d+) x (\d+) mm .*", rows["extent"]).groups()
+    # A voxel in each direction, and half a millimetre by rounding.
+    assert np.array(extent, float) == pytest.approx([92 + 11 - 45, 40, 90], abs=3.5)
+    assert float(rows["length"].split()[0]) == pytest.approx(90, abs=3.5)
+    # A tumour on a pole is not of the length: where it was, the contour ends below the pole.
+    pole = np.array([0.0, 0.0, HALF_AXES[2]]), 14.0
+    polar = replace(patient, organ=kidney(pole), parts={"tumour": ball(*pole)})
+    assert 2 * HALF_AXES[2] - 14 < polar.length_mm < 2 * HALF_AXES[2] < polar.organ.extents[2] - 10
 
 
 def test_the_complexity_of_the_tumour_is_in_the_summary(patient):

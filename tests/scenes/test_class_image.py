@@ -13,7 +13,7 @@ from test_field_cases import SPINE, inside, scan, slicer, written
 
 from app import main
 from scenes.import_findings import read_findings
-from scenes.patients.class_corrections import corrections_of
+from scenes.patients.class_corrections import _changes, corrections_of
 from scenes.patients.import_command import TISSUE_OPTIONS
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_merge import MERGE_ORDER
@@ -23,10 +23,21 @@ from scenes.tissue_classes.class_image import CLASS_IMAGE_FILE, DRAWN, DRAWN_NAM
 from scenes.tissue_classes.corrections import with_corrections
 from scenes.tissue_classes.tissue_colours import COLOURS, rgb_of
 from scenes.tissue_classes.tissue_map import CODE, TISSUES, TissueMap, codes_of_labels, tissue_map
+from scenes.volumes.voxel_grid import VoxelGrid
 from ultrasound.acoustics import tissue_table
 
 # Voxels that a class image divides along two axes.
 SPACING = (2.5, 1.5, 4.0)
+
+
+def test_what_was_changed_is_named_by_its_volume_the_largest_first():
+    """Voxels of 1 x 2 x 2.5 mm: 300 of muscle are spleen, 500 of bone are liver, 4 are too few."""
+    names = ["muscle"] * 300 + ["bone"] * 504
+    others = ["spleen"] * 300 + ["liver"] * 500 + ["spleen"] * 4
+    found, stated = (np.array([CODE[name] for name in each], np.uint8) for each in (names, others))
+    grid = VoxelGrid((1, 1, 804), np.array([1.0, 2.0, 2.5]), np.zeros(3), np.eye(3))
+    changes = _changes(found, stated, np.ones(804, bool), grid)
+    assert changes == ["bone is liver (2.5 ml)", "muscle is spleen (1.5 ml)"]
 
 
 class TestTissues:

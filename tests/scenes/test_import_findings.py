@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from ball_patient import folder_of_ball
+from conftest import rotation_about
 
 from app import main
 from scenes.import_findings import (
@@ -14,7 +15,9 @@ from scenes.import_findings import (
     read_findings,
     warning_lines,
 )
+from scenes.patients.patient_findings import _grid
 from scenes.scene import AnatomyFiles, Scene, SceneError
+from scenes.volumes.voxel_grid import VoxelGrid
 
 TEXTS = ("the rim is fat", "two of <three> lines")
 
@@ -50,6 +53,18 @@ def folder(tmp_path):
 
 def files_scene() -> Scene:
     return Scene(anatomy=AnatomyFiles())
+
+
+def test_a_place_of_a_grid_follows_from_its_findings():
+    """Of an oblique grid, as SimpleITK has it."""
+    turn = rotation_about([3, 1, 2], 50)
+    grid = VoxelGrid((9, 8, 7), np.array([0.7, 1.1, 5.0]), np.array([12.5, -80.25, 900.0]), turn)
+    found = _grid(grid)
+    index = 3, 5, 6
+    place = np.array(found.direction) @ (np.array(found.spacing_mm) * index) + found.origin_mm
+    expected = grid.image(np.zeros((7, 8, 9), np.uint8)).TransformIndexToPhysicalPoint(index)
+    # Four digits of each.
+    assert found.size == (9, 8, 7) and place == pytest.approx(expected, abs=5e-5 * (1 + 3 * 30))
 
 
 def test_warnings_are_open_until_they_are_acknowledged(folder):

@@ -162,10 +162,10 @@ class TestFlatEnd:
         def there(places):
             return KIDNEY(places) & (sign * (places - CENTRE)[..., axis] < 0.6 * AXES[axis])
 
-        _, piece = labelled((1, there), direction=direction)
+        _, piece = labelled((1, there), direction=direction, spacing=(1.5, 2.0, 2.5))
         (warning,) = flat_end_warnings(piece)
         assert f"towards the {towards} in a flat face of" in warning
-        # Of the last plane of voxels, which ends at the cut or up to 2.5 mm before it.
+        # Of the last plane of voxels, which is at the cut or up to 2.5 mm before it.
         heights = 0.6 - np.array([0, 2.5]) / AXES[axis]
         least, most = np.pi * np.delete(AXES, axis).prod() * (1 - heights**2) / 100
         assert 0.97 * least < float(re.search(r"([\d.]+) cm2", warning)[1]) < 1.03 * most

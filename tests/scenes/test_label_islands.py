@@ -1,5 +1,7 @@
 """What is labelled and connected to no kidney is named; islands of the other kidney are none of this patient's."""
 
+import re
+
 import numpy as np
 import pytest
 import SimpleITK as sitk
@@ -32,5 +34,9 @@ def test_an_island_is_named_with_volume_and_place(monkeypatch, name, value, ml, 
     lines = warnings_of(ct, image, "left")
     assert len(lines) == is_named
     if is_named:
-        assert f"ml of the {name}'s label" in lines[0] and "at 70, 35, 7" in lines[0]
+        found = rf"([\d.]+) ml of the {name}'s label touch no labelled kidney, (\d+) mm from this one at 70, 35, 7"
+        volume, gap = map(float, re.match(found, lines[0]).groups())
+        # Of voxels of 0.025 ml at the surface half are in it, at random; each body ends up to a slice before its surface.
+        assert volume == pytest.approx(ml, abs=0.05 + 0.025 * 2 * np.sqrt(4 * np.pi * radius**2 / 2.5**2 / 4))
+        assert 64 - 45 - radius - 0.5 <= gap <= 64 - 45 - radius + 2 * 4.0
     assert warnings_of(ct, image, "right") == []

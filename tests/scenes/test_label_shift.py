@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import SimpleITK as sitk
+from scipy.spatial.transform import Rotation
 from synthetic_body import BODY, DIRECTIONS, LEFT, TUMOUR, drawn, grid_around, level, points_of, with_voxels
 
+from scenes.patients.import_warnings import fat_warnings
 from scenes.patients.label_shift import LATTICE_MM, LEAST_MM, best_shift, shift_warnings
 from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_maps import box_of
@@ -24,10 +26,14 @@ WORDS = [
 ]
 
 
+# No axis along one of the patient, and none of them exchanged with another alone.
+TURNED = Rotation.from_rotvec(75 * np.array([1, 2, 2]) / 3, degrees=True).as_matrix()
+
+
 def scanned(spacing=(1.5, 1.5, 3.0), direction="identity", beside=30.0, noise_hu=15.0):
     """CT and organ of a left kidney with a tumour, in fat but for a neighbour at its front, on one grid."""
     low, high = LEFT[0] - LEFT[1] - 30, LEFT[0] + LEFT[1] + 30
-    empty = grid_around(low, high, spacing, DIRECTIONS[direction])
+    empty = grid_around(low, high, spacing, DIRECTIONS.get(direction, TURNED))
     beside_it = LEFT[0] - [0, 60, 0], np.array([80.0, 42.0, 80.0])
     ct = drawn(empty, (-100, BODY), (int(beside), beside_it), (120, LEFT), (70, TUMOUR))
     hounsfield = sitk.GetArrayFromImage(ct) + np.random.default_rng(3).normal(
@@ -48,7 +54,7 @@ def ct_and_organ():
 
 @pytest.fixture(scope="module")
 def thick():
-    return scanned(spacing=(0.8, 0.8, 8.0))
+    return scanned(spacing=(0.8, 1.0, 8.0), direction="turned")
 
 
 @pytest.mark.parametrize(("shift", "words"), [*zip(SHIFTS, WORDS, strict=True)])
@@ -70,7 +76,7 @@ def test_the_way_back_is_stated(ct_and_organ, shift, words):
         {"spacing": (0.8, 0.8, 5.0)},
         {"spacing": (3.0, 3.0, 3.0)},
         {"direction": "RAS"},
-        {"direction": "oblique"},
+        {"direction": "turned", "spacing": (1.0, 1.4, 2.8)},
     ],
 )
 def test_the_shift_is_found_and_none_where_there_is_none(how):
@@ -98,7 +104,7 @@ def test_readers_who_draw_inside_or_outside_the_edge_give_no_warning(ct_and_orga
 def test_a_shift_of_less_than_half_a_slice_is_within_it(thick, shift, lines):
     ct, organ = thick
     grid = VoxelGrid.of(ct)
-    shifted = replace(grid, origin=grid.origin + shift)
+    shifted = replace(grid, origin=grid.origin + TURNED @ shift)
     assert np.linalg.norm(best_shift(grid, sitk.GetArrayFromImage(ct), shifted, organ)) > LEAST_MM
     assert len(warned(ct, shifted, organ)) == lines
 
@@ -109,6 +115,23 @@ def test_no_shift_is_stated_where_the_fit_is_beyond_reach(ct_and_organ, shift):
     ct, organ = ct_and_organ
     grid = VoxelGrid.of(ct)
     assert warned(ct, replace(grid, origin=grid.origin + shift), organ) == ()
+
+
+@pytest.mark.parametrize("side", [0, 1, 2])
+def test_the_share_of_fat_is_that_of_a_shell_of_4_mm(side):
+    """A cuboid of 32 x 40 x 48 mm has 30.7 ml within 4 mm of its faces; with 3 or 4 mm of fat on one side of it."""
+    spacing, size_mm = np.array([1.0, 2.0, 4.0]), np.array([32.0, 40.0, 48.0])
+    count = np.rint(size_mm / spacing).astype(int)
+    organ = np.pad(np.ones(count[::-1], bool), 3)
+    hounsfield = np.full(organ.shape, 120.0)
+    layers = (3, 2, 1)[side]
+    np.moveaxis(hounsfield, 2 - side, 0)[3 : 3 + layers] = -100.0
+    grid = VoxelGrid(organ.shape[::-1], spacing, np.array([40.0, -7.0, 900.0]), TURNED)
+    (warning,) = fat_warnings(grid, hounsfield, organ, organ, 4.0)
+    fat = layers * spacing[side] * size_mm.prod() / size_mm[side]
+    assert warning.startswith(
+        f"{fat / (size_mm.prod() - (size_mm - 8).prod()):.0%} of the organ's rim is fat"
+    )
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from ellipsoid_kidney import ball, kidney
 
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.kidney_axes import KidneyAxes
-from scenes.nephrometry import face_of, padua_score, renal_score
+from scenes.nephrometry import Component, NephrometryScore, face_of, padua_score, renal_score
 from scenes.scene import EMBEDDED, load_scene
 from scenes.tumour_anatomy import TumourAnatomy
 from scenes.tumour_complexity import Complexity, complexity
@@ -172,6 +172,18 @@ def test_whole_cases(case, renal, padua):
     found = tumour(**case)
     for score, expected in ((renal_score(found), renal), (padua_score(found), padua)):
         assert f"{score}, {score.complexity}" == expected
+
+
+def test_classes_begin_and_end_at_the_totals_of_the_papers():
+    """R.E.N.A.L. 4 to 6, 7 to 9, 10 to 12 (Kutikov and Uzzo 2009); PADUA 6 and 7, 8 and 9, 10 to 14 (Ficarra et al. 2009)."""
+
+    def classes(score, totals):
+        components = [(Component("all", (total,), None, "mm"),) for total in totals]
+        return [NephrometryScore(each, "", score.classes).complexity for each in components]
+
+    renal, padua = renal_score(tumour()), padua_score(tumour())
+    assert classes(renal, range(4, 13)) == ["low"] * 3 + ["moderate"] * 3 + ["high"] * 3
+    assert classes(padua, range(6, 15)) == ["low"] * 2 + ["intermediate"] * 2 + ["high"] * 5
 
 
 def test_a_total_that_is_not_certain_is_a_range():

@@ -73,11 +73,6 @@ class TestOrgan:
         with pytest.raises(PatientError, match="2 organs are labelled"):
             found(drawn(empty, (40, BODY)), labels, [1], "left")
 
-    def test_cut_off_below(self):
-        ct, labels = body(z=(-20.0, 90.0))
-        with pytest.raises(PatientError, match="cut off at the border"):
-            imported(ct, labels, organ=[2])
-
     def test_ct_without_a_negative_value(self, ct_and_labels):
         ct, labels = ct_and_labels
         clipped = with_voxels(ct, np.maximum(sitk.GetArrayFromImage(ct), 0))

@@ -1,5 +1,7 @@
 """Patient import: a synthetic body whose organs are known in LPS mm."""
 
+import re
+
 import igl
 import numpy as np
 import pytest
@@ -303,10 +305,18 @@ class TestImportRefuses:
         with pytest.raises(PatientError, match=r"has \d\d% of its voxels in the CT"):
             imported(ct, half, [2], "left")
 
-    def test_organ_cut_off(self):
-        ct, labels = body(z=(-90.0, 20.0))
-        with pytest.raises(PatientError, match="cut off at the border"):
+    @pytest.mark.parametrize(("z", "end"), [((-90.0, 20.0), -1), ((-20.0, 90.0), 0)])
+    def test_organ_cut_off(self, z, end):
+        """Over the section of the ellipsoid in the last slice, 4 mm thick, of pixels of 3 x 2.5 mm."""
+        ct, labels = body(z=z)
+        height = (points_of(labels)[end, 0, 0, 2] - LEFT[0][2]) / LEFT[1][2]
+        whole = np.pi * LEFT[1][0] * LEFT[1][1] * (1 - height**2) / 100
+        with pytest.raises(PatientError, match="cut off at the border") as caught:
             imported(ct, labels, organ=[2])
+        cm2 = float(re.search(r"over ([\d.]+) cm2", str(caught.value))[1])
+        # The tumour, a ball of 11 mm, takes a part of the upper one.
+        part = sitk.GetArrayFromImage(labels)[end] == 2
+        assert cm2 == pytest.approx(part.sum() * 7.5 / 100, abs=0.06) and 0.6 * whole < cm2 < 1.04 * whole
 
     def test_implausible_organ(self, ct_and_labels):
         ct, labels = ct_and_labels

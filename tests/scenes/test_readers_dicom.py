@@ -225,7 +225,11 @@ class TestGeometry:
         )
         series.write(np.random.default_rng(1).permutation(9))
         volume, voxels = read_ct(tmp_path)
-        assert f"tilted by {TILT:.1f} degrees" in " ".join(volume.notes)
+        # From the first slice to the last, eight times 2.5 mm along the table.
+        shifted = f"by up to {20 * np.sin(np.radians(TILT)):.1f} mm"
+        assert f"tilted by {TILT:.1f} degrees: slices shifted within their planes {shifted}" in " ".join(
+            volume.notes
+        )
         normal = tilted[:, 2]
         np.testing.assert_allclose(volume.grid.spacing, [0.8, 0.7, 2.5 * np.cos(np.radians(TILT))], atol=1e-5)
         np.testing.assert_allclose(volume.grid.direction[:, 2], normal, atol=1e-6)

@@ -1,14 +1,16 @@
 """Segments whose names say nothing, such as Segment_1: tissue and side by the codes of 3D Slicer and of DICOM."""
 
+import re
+
 import numpy as np
 import pydicom
 import pytest
 import SimpleITK as sitk
 from dicom_series import Series, refusal, write_segmentation
 from pydicom.dataset import Dataset
-from synthetic_body import LEFT, body
+from synthetic_body import LEFT, TUMOUR, body
 
-from scenes.patients.import_warnings import label_warnings
+from scenes.patients.import_warnings import _place, label_warnings
 from scenes.patients.organ_selection import find_organs
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import LabelMap
@@ -184,3 +186,14 @@ def test_coded_segments_beside_the_organ_are_known(tmp_path):
         assert piece.centre_x_mm == pytest.approx(LEFT[0][0], abs=3)
         (warning,) = label_warnings(one, piece, True, [one])
         assert words in warning
+    volume, *place = re.search(
+        r"\(([\d.]+) ml\).* in the middle third, at (\d+), (\d+), (\d+) mm", warning
+    ).groups()
+    # The tumour that is not known, to a part of a voxel of 6 x 5 x 8 mm.
+    assert np.array(place, float) == pytest.approx(TUMOUR[0], abs=2.0)
+    assert float(volume) == pytest.approx((plain.values == 3).sum() * 0.24, abs=0.05)
+    # From -33 to 57 mm.
+    for z, third in ((42.0, "upper"), (-18.0, "lower")):
+        assert (
+            _place(piece, np.array([[70.0, 35.0, z]])) == f"in the {third} third, at 70, 35, {z:.0f} mm (LPS)"
+        )

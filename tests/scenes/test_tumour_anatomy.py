@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from ellipsoid_kidney import HALF_AXES, ball, in_ellipsoid, kidney
+from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
 from scenes.anatomy import Grid
@@ -57,6 +58,24 @@ def test_a_ball(tumour):
     assert found.contact_cm2 == pytest.approx(
         ((1 - area) * 4 * np.pi * radius**2) / 100, rel=0.02, abs=strip / 100
     )
+
+
+def test_an_oblique_ellipsoid():
+    """Its diameter is its long axis; along an axis p it is 2 |diag(a) R' p| high, within the kidney all around."""
+    half, turn = np.array([9.0, 6.0, 13.0]), Rotation.from_rotvec([0.5, 0.9, -0.4]).as_matrix()
+    centre = np.array([4.0, 2.0, 17.0])
+    surface = trimesh.creation.icosphere(subdivisions=4)
+    surface = trimesh.Trimesh(surface.vertices * half @ turn.T + centre, surface.faces)
+    found = tumour_anatomy(kidney(), surface, {})
+    assert found.diameter_mm == pytest.approx(26.0, rel=2e-3)
+    assert found.volume_ml == pytest.approx(4 / 3 * np.pi * half.prod() / 1000, rel=5e-3)
+    polar = found.axes.polar
+    height, reach = (centre - found.axes.centre) @ polar, np.linalg.norm(half * (turn.T @ polar))
+    assert found.heights_mm == pytest.approx((height - reach, height + reach), abs=0.02)
+    # Thomsen's formula is right to 1.1 %.
+    pairs = [np.prod(np.delete(half, axis)) ** 1.6075 for axis in range(3)]
+    assert found.contact_cm2 == pytest.approx(4 * np.pi * np.mean(pairs) ** (1 / 1.6075) / 100, rel=0.015)
+    assert found.exophytic_share == 0
 
 
 @pytest.mark.parametrize("depth_mm", [4.0, 10.0, 16.0])
@@ -130,10 +149,11 @@ def test_distance_to_labelled_voxels(spacing, turn):
 def test_only_the_wide_part_of_a_vessel_is_the_main_one(turn):
     tumour = ball([0.0, 0.0, 0.0], 10.0)
     main, branch = tube(-18.0, 3.0), tube(-11.5, 1.2)
-    both = voxels_of(lambda p: np.minimum(main(p), branch(p)), (0.8,) * 3, turn)
+    both = voxels_of(lambda p: np.minimum(main(p), branch(p)), (0.4, 0.8, 1.6), turn)
     assert voxel_distance_mm(tumour, both) < 1
-    assert main_vessel_gap_mm(tumour, both, 4.0) == pytest.approx(18 - 3 - 10, abs=0.8)
-    assert main_vessel_gap_mm(tumour, both, 8.0) == np.inf
+    # Half a voxel across the vessel, and one along the distance from the border.
+    assert main_vessel_gap_mm(tumour, both, 4.0) == pytest.approx(18 - 3 - 10, abs=0.6)
+    assert main_vessel_gap_mm(tumour, both, 5.0) < np.inf == main_vessel_gap_mm(tumour, both, 7.7)
 
 
 def test_a_main_vessel_is_searched_around_the_tumour():

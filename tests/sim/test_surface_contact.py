@@ -7,7 +7,7 @@ import trimesh
 from lattice_tissue import DENSITY, YOUNG_KPA, G, jacobians, lifted, position, put, settings_of, tissue_of
 
 from sim.body import BodyState
-from sim.fields import array_of, fill, zeros
+from sim.fields import array_of, fill, fill_evenly, zeros
 from sim.kernels import kernel
 from sim.shapes import ConvexTool, Plane, SignedDistanceField
 from sim.surface_contact import NEAR_MM, PENALTY_DEPTH_MM, REACH_MM, TANGENTIAL_RATIO
@@ -67,8 +67,11 @@ def layer_depth(solver, gravity) -> float:
     return weight(solver) * gravity / G / (24 * 20) / (1e3 * YOUNG_KPA) * PENALTY_DEPTH_MM
 
 
-def test_a_block_sticks_below_the_friction_angle_and_slides_above(kept, block):
+@pytest.mark.parametrize("friction", [0.2, FRICTION])
+def test_a_block_sticks_below_the_friction_angle_and_slides_above(kept, block, friction):
+    """Of the coefficient that is set, not of that with which it was built."""
     solver = kept(on_plane, block)
+    fill_evenly(solver.contacts.coefficient, friction)
     built = solver.snapshot()
     assert "stick" in built.history
     # Depths are pressure * PENALTY_DEPTH_MM / E; a point's height is a sum over 8 nodes, each known to an ulp.
@@ -77,21 +80,21 @@ def test_a_block_sticks_below_the_friction_angle_and_slides_above(kept, block):
     last = {}
     for beyond_deg in (-1.0, 1.0):
         solver.restore(built)
-        angle = np.arctan(FRICTION) + np.radians(beyond_deg)
+        angle = np.arctan(friction) + np.radians(beyond_deg)
         settings = settings_of(20, (G * np.sin(angle), 0.0, -G * np.cos(angle)), damping=0.0)
         speed = []
         for _ in range(2):
             rest(solver, 40, settings)
             speed.append(array_of(solver.body.velocity)[:, 0].mean())
         force = contact_force(solver, solver.contacts.shapes[0]) / weight(solver)
-        # Gravity acts with sin(angle); Coulomb's friction is at most 0.35 cos(angle), 5 % less one degree beyond.
-        held = min(np.sin(angle), FRICTION * np.cos(angle))
+        # Gravity acts with sin(angle); Coulomb's friction is at most the coefficient's share of cos(angle), less one degree beyond.
+        held = min(np.sin(angle), friction * np.cos(angle))
         assert force == pytest.approx([-held, 0.0, np.cos(angle)], abs=tolerance * np.cos(angle))
         last[beyond_deg] = speed
     # It is at rest, to the rounding of 1e-5 mm a step; and it gathers speed as Coulomb has it, damping off.
     assert abs(last[-1.0][1]) < 1e-2
-    slope = np.arctan(FRICTION) + np.radians(1.0)
-    gained = 40 / 60 * G * (np.sin(slope) - FRICTION * np.cos(slope))
+    slope = np.arctan(friction) + np.radians(1.0)
+    gained = 40 / 60 * G * (np.sin(slope) - friction * np.cos(slope))
     assert last[1.0][1] - last[1.0][0] == pytest.approx(gained, rel=0.05)
 
 

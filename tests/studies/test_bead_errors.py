@@ -111,6 +111,7 @@ def test_report_and_table_show_these_figures(experiment, case):
     assert set(figures) == KEYS | {"clusters", "memberships"} and figures["case"] == "ball"
     assert figures["overall_mean_mm"] == pytest.approx(0.5)
     assert figures["ms_per_step"]["median"] == 2 and figures["ms_per_step"]["mean"] == 3
+    assert "speed  2.0 ms a step (median), 6.0 at most" in summary(figures, "m")
     distances = probe_distances(case)[1:].ravel()
     expected = np.corrcoef(distances, np.tile(np.linspace(0, 1, 12), 2))[0, 1]
     assert figures["distance_correlation"] == pytest.approx(expected, abs=1e-6)

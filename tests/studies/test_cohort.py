@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import shutil
 from concurrent.futures import Future
 from pathlib import Path
@@ -18,7 +19,7 @@ from rehearsal.planning.plan_file import MOST_SWEEPS, Plan, PlanError, read_plan
 from rehearsal.worker_processes import error_of, has_ended
 from scenes.anatomy import fingerprint, load_anatomy
 from scenes.scene import load_scene
-from studies.cohort import cohort_command, patient_run
+from studies.cohort import cohort_command, cohort_table, patient_run
 from studies.cohort.cohort_table import PatientRow
 from studies.cohort.patient_run import PatientResult
 from ultrasound.probe import PROBES
@@ -336,5 +337,46 @@ def test_a_folder_with_something_else_is_refused(tmp_path, capsys, text, words):
     assert file.read_bytes() == before
 
 
-def test_rows_have_the_figures_of_their_press():
-    assert set(patient_run.MEASURED) < set(PatientRow.model_fields)
+def test_a_row_has_the_figures_of_the_deepest_press_and_of_the_first_sweep():
+    """Each another number, so that no column can have that of another."""
+    stages = [
+        dict(indentation_mm=5.0 * k) | {name: k + n / 8 for n, name in enumerate(patient_run.MEASURED)}
+        for k in (1, 2)
+    ]
+    report = dict(
+        finite=True, stages=stages, settled_shift_mm=3.4, volume_ratio_min=0.97, fallbacks=["a", "b"]
+    )
+    sweeps = [
+        SimpleNamespace(
+            name=name, score=score, parts=dict(seen=seen, compression_mean_mm=score / 40, path_mm=score * 3)
+        )
+        for name, score, seen in (("one pass", 80.0, 0.86), ("two passes", 60.0, 0.9))
+    ]
+    found = cohort_command._figures(PatientResult(report, SimpleNamespace(sweeps=sweeps), "", 41.6))
+    press = dict(
+        compression_mm=2.0,
+        tumour_shift_mm=2.125,
+        to_tumour_mm=2.25,
+        tumour_depth_mm=2.375,
+        margin_mm=2.5,
+        force_n=2.625,
+    )
+    settled = dict(indentation_mm=10.0, settled_shift_mm=3.4, volume_ratio_min=0.97, states_restored=2)
+    sweep = dict(sweep="one pass", score=80.0, covered=0.86, sweep_compression_mm=2.0, sweep_path_mm=240.0)
+    assert found == press | settled | sweep | dict(state="done", message="", seconds=41.6)
+    row = PatientRow(patient=3, title="A kidney", trials=8, kidney_ml=151.6, tumour_ml=8.24, **found)
+    heads, figures = (re.split("  +", line.strip()) for line in cohort_table.text_of([row]).splitlines()[:2])
+    assert dict(zip(heads, figures[1:], strict=True)) == {
+        "title": "A kidney",
+        "kidney, ml": "152",
+        "tumour, ml": "8.2",
+        "settled by, mm": "3.4",
+        "pressed, mm": "10.0",
+        "force, N": "2.62",
+        "tumour shift, mm": "2.1",
+        "restored": "2",
+        "score": "80.0",
+        "covered": "86%",
+        "s": "42",
+        "state": "done",
+    }

@@ -1,6 +1,8 @@
 """The study of uncertainty: what is varied, its bands and indices against a known function, and the panel's bands."""
 
+import csv
 import json
+import re
 
 import numpy as np
 import pytest
@@ -107,27 +109,46 @@ def test_an_outcome_depends_on_its_values_alone_here_and_on_a_cluster(problem, c
 
 
 def test_bands_and_indices_are_those_of_a_known_function():
-    """y = a + 4 b + 0 c over uniform parameters: variances as 1 to 16 to 0, and additive."""
+    """y = a + 4 b + 0 c over uniform parameters where the press is deepest, and 2 a + 0 b + c before: additive variances."""
     unknowns = [Unknown(name, "", 0.0, 0.5, 1.0, is_ratio=False) for name in "abc"]
     values = samples_of(unknowns, 256)
     assert len(values) == count_of(unknowns, 256) == 256 * 5
-    y = np.array([each["a"] + 4 * each["b"] for each in values])
-    outcomes = np.full((len(y), 2, len(QUANTITIES) + 3), np.nan)
-    outcomes[:, :, 0] = y[:, None] * [0.5, 1.0]
+    outcomes = np.full((len(values), 2, len(QUANTITIES) + 3), np.nan)
+    outcomes[:, 0, 3] = [2 * each["a"] + each["c"] for each in values]
+    outcomes[:, 1, 3] = [each["a"] + 4 * each["b"] for each in values]
+    # Variances of 4 / 12, and of 12^2 / 12^2 together: their first-order indices would be 0.
+    outcomes[:, :, 4] = [[2 * each["a"] + 12 * (each["b"] - 0.5) * (each["c"] - 0.5)] * 2 for each in values]
     total = indices_of(unknowns, outcomes)
-    assert list(total) == [QUANTITIES[0]]
-    found = [total[QUANTITIES[0]][name]["total"] for name in "abc"]
-    assert found == pytest.approx([1 / 17, 16 / 17, 0.0], abs=0.02)
-    shallow, deep = (row[QUANTITIES[0]] for row in bands_of(outcomes))
+    assert list(total) == [QUANTITIES[3], QUANTITIES[4]]
+    for quantity, indices in ((3, [1 / 17, 16 / 17, 0.0]), (4, [0.25, 0.75, 0.75])):
+        for name, index in zip("abc", indices, strict=True):
+            found = total[QUANTITIES[quantity]][name]
+            assert found["total"] == pytest.approx(index, abs=found["confidence"] + 1e-3)
+            assert found["confidence"] < 0.2
+    shallow, deep = (row[QUANTITIES[3]] for row in bands_of(outcomes))
     # b's own percentiles 5, 50 and 95, to what a varies.
     assert (deep["low"], deep["median"], deep["high"]) == pytest.approx((0.7, 2.5, 4.3), abs=0.1)
-    assert shallow["median"] == pytest.approx(deep["median"] / 2, abs=1e-3)
+    # A trapezium over 0 to 3: its first and last twentieths are triangles of the height x / 2.
+    assert (shallow["low"], shallow["median"], shallow["high"]) == pytest.approx(
+        (0.2**0.5, 1.5, 3 - 0.2**0.5), abs=0.05
+    )
     assert POSITION not in bands_of(outcomes)[0]
+
+
+def test_the_band_of_the_position_is_the_distance_from_the_median_place():
+    """Places u^2 along a line of 10 mm, u evenly in 0 to 1: their median is at a quarter, their mean at a third."""
+    u, along = np.linspace(0, 1, 20_001), 10 * np.array([2.0, -1.0, 2.0]) / 3
+    outcomes = np.zeros((len(u), 1, len(QUANTITIES) + 3))
+    outcomes[:, 0, len(QUANTITIES) :] = (u**2)[:, None] * along + [3.0, 40.0, -7.0]
+    # |u^2 - 1/4| < d: sqrt(1/4 + d) - sqrt(1/4 - d) of all, and beyond a quarter, sqrt(1/4 + d).
+    expected = dict(low=np.sqrt(1 / 16 - 0.24875**2), median=np.sqrt(1 / 16 - 0.125**2), high=0.95**2 - 0.25)
+    found = bands_of(outcomes)[0][POSITION]
+    assert found == pytest.approx({name: 10 * d for name, d in expected.items()}, abs=2e-3)
 
 
 def test_the_command_reports_writes_and_is_read_again(tmp_path, monkeypatch, capsys):
     def known(problem: PressProblem, values: dict[str, float]) -> np.ndarray:
-        row = np.array([1.0, 2.0, 3.0, 4.0, values["tumour modulus"] / 10, 6.0, 0.0, 0.0, 0.0])
+        row = np.array([1.0, 2.0, 3.0, 4.0, values["tumour modulus"] / 10, 6.0, 7.0, 8.0, 9.0])
         return np.stack([row / 2, row, row * 2])
 
     class Here:
@@ -147,15 +168,47 @@ def test_the_command_reports_writes_and_is_read_again(tmp_path, monkeypatch, cap
     out = tmp_path / "out"
     assert app.main(["study", "uncertainty", "--samples", "8", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert "tumour modulus" in printed and "force on the probe" in printed and "Varied:" in printed
+    assert "tumour modulus" in printed and "At 6 mm, over 72 presses:" in printed
     report = json.loads((out / "uncertainty.json").read_text())
+    rows = list(csv.DictReader((out / "uncertainty.csv").read_text().splitlines()))
     total = report["sobol_total"]["force_n"]
     assert max(total, key=lambda name: total[name]["total"]) == "tumour modulus"
-    assert (out / "uncertainty.png").stat().st_size > 10_000 and (out / "uncertainty.csv").is_file()
+    assert (out / "uncertainty.png").stat().st_size > 10_000 and len(rows) == 72
+    deepest = dict(
+        tumour_shift_mm=2.0, to_tumour_mm=4.0, tumour_depth_mm=6.0, margin_mm=8.0, compression_mm=12.0
+    )
+    deepest |= dict(
+        force_n=float(rows[0]["tumour modulus"]) / 5, tumour_x_mm=14.0, tumour_y_mm=16.0, tumour_z_mm=18.0
+    )
+    found = {name: float(rows[0][f"{name} (deepest)"]) for name in deepest}
+    assert found == pytest.approx(deepest)
     bands = read_bands(out / "uncertainty.json")
     assert bands.indentations_mm == [2.0, 4.0, 6.0]
     assert app.main(["study", "uncertainty", "--samples", "12", "--out", str(out)]) == 2
     assert "expected a power of two" in capsys.readouterr().err
+
+
+def test_the_table_is_of_the_deepest_press_and_ranks_what_it_depends_on():
+    def band(low: float) -> dict[str, float]:
+        return dict(low=low, median=low + 1, high=low + 3)
+
+    def index(total: float) -> dict[str, float]:
+        return dict(total=total, confidence=0.01)
+
+    report = dict(
+        indentations_mm=[2.0, 6.0],
+        samples=72,
+        parameters=[dict(name="fat", unit="kPa/mm", low=0.1, typical=0.2, high=0.4)],
+        bands=[{"force_n": band(1.0)}, {"force_n": band(2.0), "margin_mm": band(-4.0)}],
+        sobol_total={"force_n": {"fat": index(0.12), "capsule": index(0.8), "friction": index(0.3)}},
+    )
+    lines = [re.split("  +", line.strip()) for line in uncertainty_command.table(report).splitlines()]
+    assert lines[0] == ["At 6 mm, over 72 presses:"]
+    assert lines[2:4] == [
+        ["force on the probe, N", "2.00", "3.00", "5.00", "capsule", "0.80", "friction", "0.30"],
+        ["margin in the image, mm", "-4.00", "-3.00", "-1.00"],
+    ]
+    assert lines[-1] == ["fat", "0.1 to 0.4 kPa/mm"]
 
 
 def bands(**changes) -> UncertaintyBands:

@@ -1,7 +1,10 @@
 """Blood flow at voxels: along drawn vessels, from and to the kidney by their kind, with a parabolic profile."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from conftest import rotation_about
 
 from ultrasound.acoustics import TissueVoxels
 from ultrasound.blood_flow import (
@@ -13,6 +16,7 @@ from ultrasound.blood_flow import (
     pulse_share,
     stored_flow,
 )
+from ultrasound.scanner import Scanner
 
 SPACING, SHAPE, RADIUS = np.array([0.8, 0.8, 0.8]), (90, 40, 40), 3.0
 TISSUES = {1: "kidney", 2: "artery", 3: "vein", 4: "vessel", 5: "necrosis", 6: "tumour"}
@@ -49,6 +53,47 @@ def test_blood_flows_to_the_kidney_in_arteries_and_from_it_in_veins(value, kind,
     assert np.linalg.norm(flow[middle, :3], axis=1).max() == pytest.approx(peak, rel=0.1)
     assert (flow[labels == value, 3] == np.float32(table["resistive_index"])).all()
     assert (flow[labels == value, 4] == 1.0).all() and (flow[labels == 0] == 0).all()
+
+
+@pytest.mark.parametrize("kind, sign", [("artery", 1), ("vein", -1)])
+def test_the_scanners_flow_is_along_the_vessel_in_thick_oblique_slices(monkeypatch, kind, sign):
+    """A straight vessel of 16 mm into a kidney, off the origin; where it flows and whither, in the patient."""
+    monkeypatch.setattr(
+        "ultrasound.scanner.SampledVolume", lambda values, from_mm, outside: (values, from_mm)
+    )
+    mm_from_index = np.eye(4)
+    mm_from_index[:3, :3] = rotation_about([1, 2, 3], 40) * [0.9, 1.4, 5.0]
+    shape, begin, along = (110, 80, 24), np.array([60.0, -40.0, 110.0]), np.array([0.48, 0.64, 0.6])
+    mm_from_index[:3, 3] = begin + 25 * along - mm_from_index[:3, :3] @ ((np.array(shape) - 1) / 2)
+    places = np.moveaxis(np.indices(shape), 0, -1) @ mm_from_index[:3, :3].T + mm_from_index[:3, 3] - begin
+    height = places @ along
+    beside = np.linalg.norm(places - height[..., None] * along, axis=-1)
+    labels = np.where(height > 36, 1, 0) * (beside < 30)
+    labels[(beside < 8) & (height > 0) & (height <= 36)] = 2
+    voxels = TissueVoxels(
+        np.zeros(shape, np.int16), labels, {1: "sinus", 2: kind}, np.linalg.inv(mm_from_index)
+    )
+    anatomy = SimpleNamespace(voxels=voxels)
+    given = SimpleNamespace(anatomy=anatomy, _with_crater=lambda name, volume: volume)
+    values, from_mm = Scanner.flow.func(given)
+    flows = np.argwhere(np.linalg.norm(values[..., :3], axis=-1) > 0)
+    at = flows @ np.linalg.inv(from_mm)[:3, :3].T + np.linalg.inv(from_mm)[:3, 3] - begin
+    assert at.mean(axis=0) == pytest.approx(18 * along, abs=2.5)
+    middle = flows[(at @ along > 9) & (at @ along < 27)]
+    mean = values[tuple(middle.T)][:, :3].mean(axis=0)
+    # Both ends of the vessel are half a slice off at most: over its length of 36 mm that is 2 atan(2.5 / 36).
+    assert sign * mean @ along > np.cos(2 * np.arctan(2.5 / 36)) * np.linalg.norm(mean)
+    # Faster towards the middle: the distance from the wall is right to half a millimetre in the mean of a ring, where the profile's slope is
+    # 2 / 8 a millimetre at most. The widest distance is that of the middle of a voxel, 2.4 mm wide in the mean.
+    at = middle @ np.linalg.inv(from_mm)[:3, :3].T + np.linalg.inv(from_mm)[:3, 3] - begin
+    away = np.linalg.norm(at - np.outer(at @ along, along), axis=1)
+    speed = np.linalg.norm(values[tuple(middle.T)][:, :3], axis=1)
+    for ring in range(8):
+        found = speed[(away >= ring) & (away < ring + 1)].mean() / speed.max()
+        assert found == pytest.approx(1 - ((ring + 0.5) / 8) ** 2, abs=0.5 * 2 / 8)
+    table = flow_table()[kind]
+    slowest, fastest = np.interp([8 - 2.4, 8], table["radius_mm"], table["peak_cm_s"]) / 100
+    assert 0.999 * slowest < speed.max() < 1.001 * fastest
 
 
 def test_the_profile_of_a_vessel_is_parabolic():

@@ -14,11 +14,12 @@ import SimpleITK as sitk
 from conftest import rotation_about
 
 import app
+from rehearsal.commands.reconstruct_command import _describe, in_words
 from rehearsal.coordinates import probe_in_patient
 from rehearsal.notices import Notices
 from rehearsal.reconstruction import compression_correction
 from rehearsal.reconstruction.compression_correction import CompressionCorrection
-from rehearsal.reconstruction.sweep_volumes import image_poses_of
+from rehearsal.reconstruction.sweep_volumes import ImagePoses, image_poses_of
 from rehearsal.tracking.sweep_recording import SweepRecorder
 from scenes.anatomy import phantom_folder
 from scenes.scene import EMBEDDED
@@ -29,7 +30,7 @@ from studies.freehand.freehand_sweeps import sweep_of
 from ultrasound import reconstruction
 from ultrasound.probe import load_probe
 from ultrasound.probe_manipulator import image_plane, pose_at, pose_of_image_plane
-from ultrasound.sweep import PixelLabel, SweepError
+from ultrasound.sweep import PixelLabel, Sweep, SweepError
 from ultrasound.sweep_file import (
     LABELS_SUFFIX,
     SUFFIX,
@@ -302,6 +303,41 @@ def swept(tmp_path_factory) -> Path:
         sweep.add(40 + 80 * each, each, probe, pose, k / 10)
     sweep.close()
     return folder / "over.igs.mha"
+
+
+def test_a_sweep_is_described_by_its_steps_and_speeds():
+    """Steps of 3, 12 and 5 mm, in 0.5, 1 and 2 s; the image of the third frame, on the way of 12 mm, was not tracked."""
+    times = (7.0, 7.5, 8.0, 8.5, 10.5)
+    frames = [dict(Timestamp=str(time)) for time in times]
+    sweep = Sweep(np.zeros((5, 2, 2), np.uint8), frames, {})
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, :3, 3] = [[0, 0, 9], [1, -2, 11], [9, 6, 7], [9, 3, 3]]
+    found = _describe(sweep, ImagePoses(np.array([0, 1, 3, 4]), poses))
+    assert found == dict(
+        frames=5,
+        used=4,
+        way_mm=20.0,
+        between_median_mm=5.0,
+        between_max_mm=12.0,
+        speed_median_mm_s=6.0,
+        speed_max_mm_s=12.0,
+    )
+    part = dict(dice=0.9123, hd95_mm=1.254, volume_percent=-3.46, centroid_mm=0.567)
+    organ = dict(scanned=0.234, whole=None, scanned_part=part)
+    tumour = dict(scanned=0.876, whole=None, scanned_part=dict.fromkeys(part))
+    report = found | dict(
+        shape=[30, 40, 50],
+        spacing_mm=0.5,
+        method="smooth",
+        undo_compression=True,
+        agreement=dict(organ=organ, tumour=tumour),
+    )
+    assert in_words(report).splitlines() == [
+        "images    4 of 5 with a pose, 5.00 mm apart (median; at most 12.00), 6 mm/s",
+        "volume    30 x 40 x 50 voxels of 0.5 mm, smooth, compression corrected",
+        "organ     23 % scanned; only in this small part Dice 0.912, HD95 1.25 mm, volume -3.5 %, centroid 0.57 mm off",
+        "tumour    88 % scanned; in this part nothing found",
+    ]
 
 
 def test_reconstruct_makes_a_volume_and_compares_it(swept, tmp_path, capsys):
