@@ -254,17 +254,21 @@ class RigidCorrection:
     def sum_contacts(self, block, has_forces):
         """Forces of the shapes on a block's contact points, and their derivatives."""
         sums = no_sums()
-        centre = self.body.position[self.centre] + self.translation[None]
+        rotation, centre = self.rotation[None], self.body.position[self.centre]
+        moved_centre = centre + self.translation[None]
         for q in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.contacts.count)):
             if self.contacts.near[q] > 0:
-                x = self.moved(self.contacts.point[q])
+                arm = rotation @ (self.contacts.point[q] - centre)
+                x = moved_centre + arm
                 f, k = self.contacts.point_force(q, x, has_forces)
-                arm = cross_matrix(x - centre)
+                turned = ti.Matrix.rows([arm.cross(k[0, :]), arm.cross(k[1, :]), arm.cross(k[2, :])])
                 sums.force += f
-                sums.torque += arm @ f
+                sums.torque += arm.cross(f)
                 sums.translational += k
-                sums.mixed -= k @ arm
-                sums.rotational -= arm @ k @ arm
+                sums.mixed += turned
+                sums.rotational += ti.Matrix.cols(
+                    [arm.cross(turned[:, 0]), arm.cross(turned[:, 1]), arm.cross(turned[:, 2])]
+                )
         self.contact_sums.store(block, sums)
 
     @ti.func

@@ -195,9 +195,9 @@ class ShapeMatching:
             reference = four(self.body.predicted[first])
             sums = tm.mat4(0.0)
             for k in range(first, last):
-                predicted = four(self.body.predicted[k])
+                predicted, at = four(self.body.predicted[k]), self.local[k]
                 self.predicted[k] = predicted
-                sums += self.moment_of(k, predicted - reference)
+                sums += self.moment_of(k, at, predicted - reference)
             self.add_moment(p, reference, tm.mat4(0.0), sums)
         for p in range(self.multi_count, self.patch_count):
             k = self.patch_start[p]
@@ -211,11 +211,12 @@ class ShapeMatching:
             self.body.predicted[k] = self.predicted[k].xyz
 
     @ti.func
-    def moment_of(self, k, moved):
-        """Contribution of particle k, displaced by ``moved``, to its patch's moment (rows: columns of the moment) and sum (last row)."""
+    def moment_of(self, k, at, moved):
+        """Contribution of particle k, ``local`` at a place and displaced by ``moved``, to its patch's moment (rows: columns of the moment) and
+        sum (last row).
+        """
         if ti.static(self.body.mass_scaled):
             moved *= self.body.mass_scale[k]
-        at = self.local[k]
         return ti.Matrix.rows([at.x * moved, at.y * moved, at.z * moved, moved])
 
     @ti.func
@@ -295,7 +296,7 @@ class ShapeMatching:
                 at = self.local[k]
                 predicted = keep * self.predicted[k] + at.x * x + at.y * y + at.z * z + origin
                 self.predicted[k] = predicted
-                sums += self.moment_of(k, predicted - reference)
+                sums += self.moment_of(k, at, predicted - reference)
             self.add_moment(p, reference, tm.mat4(0.0), sums)
         for p in range(self.multi_count, self.patch_count):
             k = self.patch_start[p]
@@ -314,7 +315,7 @@ class ShapeMatching:
                         predicted = self.predicted[k]
                         change = four(self.contacts.pushed(k, predicted.xyz, relaxation_factor))
                         self.predicted[k] = predicted + change
-                        sums += self.moment_of(k, change)
+                        sums += self.moment_of(k, self.local[k], change)
                 moment = tm.mat4(0.0)
                 if p < self.multi_count:
                     moment = self.moment[p]

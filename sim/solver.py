@@ -82,22 +82,17 @@ class Solver:
             still = np.stack([self.tool.last_pose] * (settings.substeps + 1))
             self.tool.follow(still if tool_poses is None else tool_poses)
         # Gravity as three numbers: passing a vector to a kernel takes three times as long.
-        always = (
-            dt,
-            *settings.gravity,
-            settings.damping,
-            settings.stabilisation_iterations,
-            settings.stiffness,
-        )
-        if self.model.serial:
-            self.advance(*always, settings.substeps, settings.iterations, settings.relaxation_factor)
-        else:
-            for substep in range(settings.substeps):
-                self.launch("start", substep, 1.0, *always)
-                for iteration in range(settings.iterations):
-                    factor = relaxation_at(iteration, settings.iterations, settings.relaxation_factor)
-                    self.launch("correct", substep, factor, *always)
-                self.launch("finish", substep, 1.0, *always)
+        start = dt, *settings.gravity, settings.damping, settings.stabilisation_iterations
+        iterations = settings.iterations
+        for substep in range(settings.substeps):
+            self.start_substep(substep, *start)
+            if self.model.serial:
+                self.iterate(iterations, settings.stiffness, settings.relaxation_factor, dt)
+            else:
+                for iteration in range(iterations):
+                    factor = relaxation_at(iteration, iterations, settings.relaxation_factor)
+                    self.iterate(1, settings.stiffness, factor, dt)
+            self.finish_substep(dt)
         # The same kernel as in ``restore``: another one may round differently.
         self.model.update_frames()
 
@@ -126,49 +121,42 @@ class Solver:
         self.model.update_frames()
 
     @kernel
-    def advance(
+    def start_substep(
         self,
+        substep: int,
         dt: float,
         gravity_x: float,
         gravity_y: float,
         gravity_z: float,
         damping: float,
         stabilisation_iterations: int,
-        stiffness: float,
-        substeps: int,
-        iterations: int,
-        relaxation_factor: float,
     ):
-        """A step as one kernel on one core, for bodies so small that starting threads takes longer than they save."""
-        ti.loop_config(serialize=True)
-        for substep in range(substeps):
-            gravity = tm.vec3(gravity_x, gravity_y, gravity_z)
+        """The start of a substep: on one core for bodies so small that starting threads takes longer than they save, as the kernels below."""
+        gravity = tm.vec3(gravity_x, gravity_y, gravity_z)
+        if ti.static(self.model.serial):
+            ti.loop_config(serialize=True)
+            for _ in range(1):
+                self.start(substep, dt, gravity, damping, stabilisation_iterations)
+        else:
             self.start(substep, dt, gravity, damping, stabilisation_iterations)
-            for iteration in range(iterations):
-                factor = relaxation_at(iteration, iterations, relaxation_factor)
-                self.correct(stiffness, factor, dt)
-            self.finish(dt)
 
     @kernel
-    def launch(
-        self,
-        part: ti.template(),
-        substep: int,
-        relaxation_factor: float,
-        dt: float,
-        gravity_x: float,
-        gravity_y: float,
-        gravity_z: float,
-        damping: float,
-        stabilisation_iterations: int,
-        stiffness: float,
-    ):
-        """One of the parts of a substep as a kernel on all cores."""
-        if ti.static(part == "start"):
-            gravity = tm.vec3(gravity_x, gravity_y, gravity_z)
-            self.start(substep, dt, gravity, damping, stabilisation_iterations)
-        elif ti.static(part == "correct"):
+    def iterate(self, iterations: int, stiffness: float, relaxation_factor: float, dt: float):
+        """All iterations of a substep on one core, or the next one on all cores: only outermost loops run in parallel."""
+        if ti.static(self.model.serial):
+            ti.loop_config(serialize=True)
+            for iteration in range(iterations):
+                self.correct(stiffness, relaxation_at(iteration, iterations, relaxation_factor), dt)
+        else:
             self.correct(stiffness, relaxation_factor, dt)
+
+    @kernel
+    def finish_substep(self, dt: float):
+        """The end of a substep."""
+        if ti.static(self.model.serial):
+            ti.loop_config(serialize=True)
+            for _ in range(1):
+                self.finish(dt)
         else:
             self.finish(dt)
 

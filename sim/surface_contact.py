@@ -122,16 +122,17 @@ class SurfaceContacts:
     def find(self):
         """Lines 6-9: the contact planes of the shapes that each point's predicted position is near to."""
         for q in range(self.count):
-            p = self.interpolated(self.body.predicted, q)
-            self.point[q] = p
-            self.start[q] = self.interpolated(self.body.position, q)
+            p, start = self.interpolated(self.body.predicted, q), self.interpolated(self.body.position, q)
+            self.point[q], self.start[q] = p, start
             near = 0
             for s in ti.static(range(len(self.shapes))):
-                if ti.static(self.shapes[s].moves) or not self.is_known(s, q, p):
+                found = self.found[s, q]
+                if ti.static(self.shapes[s].moves) or not is_known(found, p):
                     surface = self.shapes[s].surface(p)
+                    found = tm.vec4(p, ti.min(surface.w, REACH_MM))
+                    self.found[s, q] = found
                     self.plane[s, q] = tm.vec4(surface.xyz, surface.xyz.dot(p) - surface.w)
-                    self.found[s, q] = tm.vec4(p, ti.min(surface.w, REACH_MM))
-                if self.found[s, q].w - (p - self.found[s, q].xyz).norm() < NEAR_MM:
+                if found.w - (p - found.xyz).norm() < NEAR_MM:
                     near |= 1 << s
             self.near[q] = near
 
@@ -139,13 +140,6 @@ class SurfaceContacts:
     def free_fraction(self, start, end):
         """Fraction of a point's path that is free of shapes; 1 for paths so short that ``find`` sees the shapes."""
         return self.time_of_impact.fraction(start, end - start, NEAR_MM)
-
-    @ti.func
-    def is_known(self, s: ti.template(), q, p):
-        """Whether the last distance query of point q to shape s is still valid at p."""
-        known = self.found[s, q]
-        moved = (p - known.xyz).norm()
-        return known.w - moved > NEAR_MM or (moved < REUSE_MM and known.w > -FAR)
 
     @ti.func
     def depth(self, s: ti.template(), q):
@@ -169,13 +163,15 @@ class SurfaceContacts:
         force, stiffness = tm.vec3(0.0), tm.mat3(0.0)
         for k in range(self.node_start[i], self.node_start[i + 1]):
             q = self.node_point[k]
-            if self.near[q] > 0:
-                weight = self.node_weight[k]
-                penalty = weight * 1e3 * self.stiffness * self.area[q]
+            near = self.near[q]
+            if near > 0:
+                p, weight = self.point[q], self.node_weight[k]
                 for s in ti.static(range(len(self.shapes))):
-                    depth = self.depth(s, q)
-                    if depth > 0.0:
-                        normal = self.plane[s, q].xyz
+                    plane = self.plane[s, q]
+                    normal = plane.xyz
+                    depth = plane.w - normal.dot(p)
+                    if (near >> s) & 1 and depth > 0.0:
+                        penalty = weight * 1e3 * self.stiffness * self.area[q]
                         force += penalty * depth * normal
                         tangential = 0.0
                         if ti.static(self.has_friction):
@@ -197,23 +193,28 @@ class SurfaceContacts:
         more than the derivative: so Newton's method converges.
         """
         force, stiffness = tm.vec3(0.0), tm.mat3(0.0)
-        penalty = 1e3 * self.stiffness * self.area[q]
+        near = self.near[q]
         for s in ti.static(range(len(self.shapes))):
-            plane = self.plane[s, q]
-            normal = plane.xyz
-            shift = p - self.shapes[s].motion(p)
-            depth = plane.w - normal.dot(shift)
-            if (self.near[q] >> s) & 1 and depth > 0.0:
-                stiffness += penalty * normal.outer_product(normal)
-                if has_force:
-                    force += penalty * depth * normal
-                    if ti.static(self.has_friction):
-                        slip = tangential(self.slip[s, q] + shift - self.point[q], normal)
-                        factor = sticking_fraction(slip, self.coefficient * depth / TANGENTIAL_RATIO)
-                        force -= penalty * TANGENTIAL_RATIO * factor * slip
-                        stiffness += (
-                            penalty * TANGENTIAL_RATIO * factor * (tm.eye(3) - normal.outer_product(normal))
-                        )
+            if (near >> s) & 1:
+                plane = self.plane[s, q]
+                normal = plane.xyz
+                shift = p - self.shapes[s].motion(p)
+                depth = plane.w - normal.dot(shift)
+                if depth > 0.0:
+                    penalty = 1e3 * self.stiffness * self.area[q]
+                    stiffness += penalty * normal.outer_product(normal)
+                    if has_force:
+                        force += penalty * depth * normal
+                        if ti.static(self.has_friction):
+                            slip = tangential(self.slip[s, q] + shift - self.point[q], normal)
+                            factor = sticking_fraction(slip, self.coefficient * depth / TANGENTIAL_RATIO)
+                            force -= penalty * TANGENTIAL_RATIO * factor * slip
+                            stiffness += (
+                                penalty
+                                * TANGENTIAL_RATIO
+                                * factor
+                                * (tm.eye(3) - normal.outer_product(normal))
+                            )
         return force, stiffness
 
     @ti.func
@@ -274,3 +275,10 @@ class SurfaceContacts:
                 # A maximum does not depend on the order, so this atomic is deterministic.
                 ti.atomic_max(self.penetration[None], -self.shapes[s].surface(p).w)
         return self.penetration[None]
+
+
+@ti.func
+def is_known(found, p):
+    """Whether the last distance query of a point, its place and distance [mm], is still valid at p."""
+    moved = (p - found.xyz).norm()
+    return found.w - moved > NEAR_MM or (moved < REUSE_MM and found.w > -FAR)
