@@ -3,8 +3,10 @@
 GGUI's own methods take Taichi fields, and compile a kernel for each of them to copy it.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
-from taichi.ui.utils import get_field_info
 
 from sim.fields import Field, array_of
 
@@ -13,10 +15,10 @@ VERTEX = 12
 
 
 class GraphicsScene:
-    """The methods of GGUI's scene that ``scene_view.py`` calls, for the fields of ``sim.fields``."""
+    """The methods of GGUI's scene that ``scene_view.py`` calls, for the fields of ``sim.fields``; ``info_of`` is what GGUI is told of an array."""
 
-    def __init__(self, scene) -> None:
-        self.scene = scene
+    def __init__(self, scene: Any, info_of: Callable) -> None:
+        self.scene, self._info_of = scene, info_of
 
     def ambient_light(self, colour) -> None:
         """Light from everywhere."""
@@ -33,9 +35,9 @@ class GraphicsScene:
         packed = _packed(vertices, per_vertex_color)
         packed[:, 3:6] = array_of(normals)
         self.scene.scene.mesh(
-            get_field_info(packed),
+            self._info_of(packed),
             True,
-            get_field_info(indices),
+            self._info_of(indices),
             (0.5, 0.5, 0.5),
             two_sided,
             len(indices),
@@ -53,7 +55,7 @@ class GraphicsScene:
         own = per_vertex_color is not None
         count = len(packed)
         self.scene.scene.lines(
-            get_field_info(packed), get_field_info(None), own, tuple(color), width, count, 0, count, 0
+            self._info_of(packed), self._info_of(None), own, tuple(color), width, count, 0, count, 0
         )
 
 

@@ -1,6 +1,6 @@
 """The window, on a screen or off-screen: 3D view, ultrasound panel, sliders, mouse and keys.
 
-It and graphics_scene.py alone import taichi.ui. A frame is drawn in this order:
+The only file that imports taichi.ui. A frame is drawn in this order:
 1. a full-window background image (background_image.py): panel, images, texts; where no graphics card draws, the 3D view too
    (software_scene.py);
 2. elsewhere, invisible quads near the camera, over the panel and the strip, which fill the depth buffer there, so that no organ covers them;
@@ -92,7 +92,7 @@ class Window:
             raise NoVulkan("no Vulkan driver found: the window and its pictures need one") from error
         atexit.register(self.close)
         self._canvas = self._window.get_canvas()
-        self._scene: Any = GraphicsScene(self._window.get_scene())
+        self._scene: Any = GraphicsScene(self._window.get_scene(), get_field_info)
         self._gui = self._window.get_gui()
         self._view: View | None = None
         self._quit = False
