@@ -37,7 +37,7 @@ def scattered(count: int = 4000, reach: float = 16.0) -> np.ndarray:
 
 
 def begin(solver: Solver, gravity: list[float], dt: float = 0.0, stabilisations: int = 0) -> None:
-    solver.launch("start", 0, 1.0, dt, *gravity, 0.0, stabilisations, 1.0)
+    solver.start_substep(0, dt, *gravity, 0.0, stabilisations)
 
 
 def test_plane(one_device):

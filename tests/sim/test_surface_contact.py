@@ -7,7 +7,7 @@ import trimesh
 from lattice_tissue import DENSITY, YOUNG_KPA, G, jacobians, lifted, position, put, settings_of, tissue_of
 
 from sim.body import BodyState
-from sim.fields import array_of, fill, fill_evenly, zeros
+from sim.fields import array_of, fill, zeros
 from sim.kernels import kernel
 from sim.shapes import ConvexTool, Plane, SignedDistanceField
 from sim.surface_contact import NEAR_MM, PENALTY_DEPTH_MM, REACH_MM, TANGENTIAL_RATIO
@@ -71,7 +71,7 @@ def layer_depth(solver, gravity) -> float:
 def test_a_block_sticks_below_the_friction_angle_and_slides_above(kept, block, friction):
     """Of the coefficient that is set, not of that with which it was built."""
     solver = kept(on_plane, block)
-    fill_evenly(solver.contacts.coefficient, friction)
+    solver.contacts.coefficient = friction
     built = solver.snapshot()
     assert "stick" in built.history
     # Depths are pressure * PENALTY_DEPTH_MM / E; a point's height is a sum over 8 nodes, each known to an ulp.
@@ -137,7 +137,7 @@ def test_a_body_from_outside_a_distance_grid_touches_its_shape(one_device, dome)
     # Its lowest points, at z = -6, are 15, then 1 mm above the table, whose distances are known 6 mm around it.
     for above, is_near in ((15.0, False), (1.0, True), (15.0, False)):
         put(solver.model, solver.body.rest_points + [0.0, 0.0, above])
-        solver.launch("start", 0, 1.0, 1e-3, 0.0, 0.0, 0.0, 0.0, 0, 1.0)
+        solver.start_substep(0, 1e-3, 0.0, 0.0, 0.0, 0.0, 0)
         assert (array_of(solver.contacts.near) > 0).any() == is_near
 
 
