@@ -15,7 +15,7 @@ VERTEX = 12
 
 
 class GraphicsScene:
-    """The methods of GGUI's scene that ``scene_view.py`` calls, for the fields of ``sim.fields``; ``info_of`` is what GGUI is told of an array."""
+    """The methods of GGUI's scene that ``scene_view.py`` calls, for the fields of ``sim.fields``; ``info_of`` describes an array to GGUI."""
 
     def __init__(self, scene: Any, info_of: Callable) -> None:
         self.scene, self._info_of = scene, info_of
