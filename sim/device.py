@@ -17,7 +17,7 @@ from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 BACKENDS = {"cuda": ti.cuda, "vulkan": ti.vulkan, "cpu": ti.cpu}
 FEW_CORES = 4
-# Taichi keeps 100 MB of compiled kernels unless told otherwise. A choice of settings adds 4 MB.
+# By default Taichi keeps 100 MB of compiled kernels. A choice of settings adds 4 MB.
 CACHE_BYTES = 1 << 30
 COUNTS = 64
 # Taichi gives a thread of a CPU at least so many iterations of a loop. A loop of fewer and longer ones runs over TASK times as many,

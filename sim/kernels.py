@@ -22,7 +22,7 @@ from taichi.types import ndarray_type
 
 from sim.fields import Field
 
-# Numbers that are compiled, where they are given as a template parameter.
+# What is compiled, wherever it is found.
 CONSTANTS = (bool, str, type(None), np.bool_)
 
 
