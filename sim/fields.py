@@ -22,11 +22,13 @@ class Field:
         split = len(shape) - within
         self.shape, self.element = tuple(map(int, shape[:split])), tuple(map(int, shape[split:]))
         self.kind = kind
+        # Those of the array in kernels: functions take no array without axes.
+        self.lengths = self.shape or (1,)
         if on_cpu():
             self.memory = np.zeros((*self.shape, *self.element), np.float32 if kind == ti.f32 else np.int32)
         else:
             make = (ti.ndarray, ti.Vector.ndarray, ti.Matrix.ndarray)[within]
-            self.memory = make(*self.element, kind, self.shape)
+            self.memory = make(*self.element, kind, self.lengths)
 
     if TYPE_CHECKING:
         # In kernels alone.
@@ -61,9 +63,9 @@ def fill(*pairs: tuple[Field, np.ndarray]) -> None:
         if isinstance(field.memory, np.ndarray):
             field.memory[...] = values
         else:
-            field.memory.from_numpy(
-                np.ascontiguousarray(values, np.float32 if field.kind == ti.f32 else np.int32)
-            )
+            kind = np.float32 if field.kind == ti.f32 else np.int32
+            values = np.ascontiguousarray(values, kind).reshape(*field.lengths, *field.element)
+            field.memory.from_numpy(values)
 
 
 def fill_evenly(field: Field, value: float) -> None:
@@ -73,4 +75,6 @@ def fill_evenly(field: Field, value: float) -> None:
 
 def array_of(field: Field) -> np.ndarray:
     """A copy of the values of a field, of shape (*field, *element)."""
-    return field.memory.copy() if isinstance(field.memory, np.ndarray) else field.memory.to_numpy()
+    if isinstance(field.memory, np.ndarray):
+        return field.memory.copy()
+    return field.memory.to_numpy().reshape(*field.shape, *field.element)

@@ -1,12 +1,13 @@
 """Kernels that are compiled for what an object is, not for its sizes: one kernel serves all patients.
 
 Taichi compiles the fields and numbers of ``self`` into a kernel, anew for each object. Of a method with ``@kernel``, fields and numbers are
-arguments, read from the object at each call. What else an object has is compiled: its class, flags, texts, and the lengths of lists. Only this
-file depends on how Taichi compiles and calls kernels.
+arguments, read from the object at each call. What else an object has is compiled: its class, flags, texts, and the lengths of lists. Of a
+method with ``@function``, which kernels call, the same are arguments. Only this file depends on how Taichi compiles and calls kernels.
 """
 
 import functools
 from collections.abc import Callable
+from itertools import count
 from types import FunctionType, MethodType
 from typing import Any
 
@@ -16,7 +17,8 @@ from taichi._lib import core
 from taichi.lang import impl, kernel_arguments, ops, runtime_ops
 from taichi.lang.enums import AutodiffMode
 from taichi.lang.expr import Expr, make_expr_group
-from taichi.lang.kernel_impl import Kernel
+from taichi.lang.kernel_impl import Func, Kernel
+from taichi.lang.matrix import make_matrix
 from taichi.lang.util import to_numpy_type
 from taichi.types import ndarray_type
 
@@ -61,12 +63,60 @@ class kernel:
         return _Call(self._compiled[-1], templates)
 
 
+class function:
+    """Decorator of a method that kernels call, without a result.
+
+    Of an object with a flag ``serial`` that is set, it is compiled as a function, whose arguments LLVM keeps in registers: addresses of
+    fields among the arguments of a kernel are loaded anew after each write. Otherwise it is a part of the kernel, since only outermost loops
+    of kernels run in parallel.
+    """
+
+    # Or Taichi would warn of code that it does not read.
+    _is_wrapped_kernel = True
+
+    def __init__(self, method: Callable) -> None:
+        functools.update_wrapper(self, method)
+        self._inline = Func(method, _classfunc=True)
+        self._numbers = count()
+
+    def __get__(self, owner: Any, of: type | None = None) -> Callable:
+        return self if owner is None else MethodType(self, owner)
+
+    def __call__(self, owner: "_TracedObject", *given: Any) -> None:
+        if not owner.serial:
+            self._inline(owner, *given)
+            return
+        runtime = impl.get_runtime()
+        within = runtime.compiling_callable
+        key = core.FunctionKey(self.__name__, self._inline.func_id, next(self._numbers))
+        compiled = runtime.prog.create_function(key)
+        trace = _Trace(_declared_in_function)
+        compiled.set_function_body(lambda: self._read(compiled, trace, owner, given))
+        runtime.compiling_callable = runtime.current_kernel.kernel_cpp = within
+        passed = [each for each in given if isinstance(each, Expr)]
+        callers, _, _ = owner._traced
+        callers.constants += trace.constants
+        for path, value in trace.arguments:
+            passed += _passed(callers.value(path, value))
+        within.ast_builder().insert_func_call(compiled, make_expr_group(passed), core.DebugInfo(""))
+
+    def _read(self, compiled: Any, trace: "_Trace", owner: "_TracedObject", given: tuple) -> None:
+        """Have Taichi read the code into the compiled function."""
+        runtime = impl.get_runtime()
+        runtime.compiling_callable = runtime.current_kernel.kernel_cpp = compiled
+        _, path, value = owner._traced
+        own = [_like(each) if isinstance(each, Expr) else each for each in given]
+        self._inline(trace.value(path, value), *own)
+        # The trace has added arguments.
+        compiled.finalize_params()
+
+
 class _Compiled:
     """A kernel compiled for objects that are alike: its arguments beyond the method's own, and what it takes as given."""
 
     def __init__(self, taichi: Kernel, given: tuple, templates: tuple) -> None:
         self.taichi = taichi
-        trace = _Trace()
+        trace = _Trace(_declared)
         places = iter(range(len(templates)))
         traced, features = list(given), []
         for i, (value, argument) in enumerate(zip(given, taichi.arguments, strict=True)):
@@ -91,7 +141,7 @@ class _Compiled:
             for i, each in enumerate(taichi.arguments)
             if i not in taichi.template_slot_locations
         ]
-        self.kinds = [kind for _, kind in trace.arguments]
+        self.kinds = [_kind(value) for _, value in trace.arguments]
         self.wanted = tuple(value for _, value in trace.constants)
         self.constants = _reader([path for path, _ in trace.constants])
         self.arguments = _reader([path for path, _ in trace.arguments])
@@ -146,9 +196,10 @@ class _Call:
 
 
 class _Trace:
-    """What a kernel reads of the objects that it is compiled for, as Python expressions of ``given``."""
+    """What a kernel reads of the objects that it is compiled for, as Python expressions of ``given``; ``declare`` makes a value an argument."""
 
-    def __init__(self) -> None:
+    def __init__(self, declare: Callable[[str, Any], Any]) -> None:
+        self._declare = declare
         self.arguments: list[tuple[str, Any]] = []
         self.constants: list[tuple[str, Any]] = []
         self._found: dict[str, Any] = {}
@@ -181,8 +232,8 @@ class _Trace:
 
     def declared(self, path: str, value: Any) -> Any:
         """Make a value an argument; what stands for it in the kernel."""
-        self.arguments.append((path, _kind(value)))
-        return _declared(path, value)
+        self.arguments.append((path, value))
+        return self._declare(path, value)
 
 
 class _TracedObject:
@@ -194,7 +245,7 @@ class _TracedObject:
     def __getattr__(self, name: str) -> Any:
         trace, path, value = self._traced
         method = getattr(type(value), name, None)
-        if isinstance(method, FunctionType):
+        if isinstance(method, FunctionType | function):
             return MethodType(method, self)
         return trace.value(f"{path}.{name}", getattr(value, name))
 
@@ -217,6 +268,7 @@ class _TracedField:
         return self._array.shape
 
     def __getitem__(self, at: Any) -> Expr:
+        at = 0 if at is None else at
         element = impl.subscript(None, self._array, *(at if isinstance(at, tuple) else (at,)))
         return _TracedElement(element.ptr, self._element) if self._element else element
 
@@ -258,10 +310,32 @@ def _declared(name: str, value: Any) -> Any:
         if value.element:
             kind = core.get_type_factory_instance().get_tensor_type(list(value.element), kind)
         unchecked = core.BoundaryMode.UNSAFE
-        return kernel_arguments.decl_ndarray_arg(kind, len(value.shape), name, False, unchecked)
+        return kernel_arguments.decl_ndarray_arg(kind, len(value.lengths), name, False, unchecked)
     if isinstance(value, ti.Matrix):
         return kernel_arguments.decl_matrix_arg(_matrix_type(value), name, 0)
     return kernel_arguments.decl_scalar_arg(ti.i32 if _kind(value) is int else ti.f32, name, 0)
+
+
+def _declared_in_function(name: str, value: Any) -> Any:
+    """Declare arguments of a function for a value: for a matrix its numbers, as a function takes none; what stands for it in the function."""
+    if not isinstance(value, ti.Matrix):
+        return _declared(name, value)
+    numbers = np.array(value.to_list(), object)
+    for index in np.ndindex(numbers.shape):
+        numbers[index] = kernel_arguments.decl_scalar_arg(ti.f32, name, 0)
+    return make_matrix(numbers.tolist())
+
+
+def _like(number: Expr) -> Expr:
+    """Declare an argument of a function for a number of its caller."""
+    return kernel_arguments.decl_scalar_arg(number.ptr.get_rvalue_type(), "", 0)
+
+
+def _passed(argument: Any) -> list[Any]:
+    """What passes a caller's argument on to a function: lengths and address of a field, the numbers of a matrix."""
+    if isinstance(argument, _TracedField):
+        return core.get_external_tensor_real_func_args(argument._array.ptr, core.DebugInfo(""))
+    return impl.get_runtime().compiling_callable.ast_builder().expand_exprs([argument.ptr])
 
 
 def _matrix_type(value: ti.Matrix) -> Any:
@@ -283,7 +357,7 @@ def _set_argument(context: Any, at: tuple, value: Any) -> None:
     if isinstance(value, Field):
         memory = value.memory
         if isinstance(memory, np.ndarray):
-            context.set_arg_external_array_with_shape(at, memory.ctypes.data, memory.nbytes, value.shape, 0)
+            context.set_arg_external_array_with_shape(at, memory.ctypes.data, memory.nbytes, value.lengths, 0)
         else:
             context.set_arg_ndarray(at, memory.arr)
     elif isinstance(value, ti.Matrix):

@@ -12,6 +12,7 @@ import taichi.math as tm
 
 from sim.body import Body
 from sim.fields import Field, zeros
+from sim.kernels import function
 from sim.linear_algebra import axial, cross_matrix, inverse_of, rotation_by
 from sim.surface_contact import NEAR_MM, SurfaceContacts
 
@@ -147,7 +148,7 @@ class RigidCorrection:
         self.change_mm = zeros()
         self.fraction = zeros()
 
-    @ti.func
+    @function
     def move(self, dt: float):
         """Move all predicted positions by the rigid part of their velocities, corrected by Newton steps, up to the time of impact."""
         for block in range(self.blocks):

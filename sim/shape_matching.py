@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from sim.body import ParticleBody
 from sim.device import is_too_small
 from sim.fields import field_of, fields_of, zeros
-from sim.kernels import kernel
+from sim.kernels import function, kernel
 from sim.linear_algebra import four, rotation_near, row
 from sim.particle_contact import REACH_RADII, ShapeContacts
 from sim.sampling import Patches, RestBody, fill_body, group_into_patches
@@ -176,7 +176,7 @@ class ShapeMatching:
         if ti.static(self.has_contacts):
             self.push_out(relaxation_factor)
 
-    @ti.func
+    @function
     def gather(self):
         """Read the predicted positions, and mark the patches that touch a shape."""
         self.sum_patches()
@@ -187,7 +187,7 @@ class ShapeMatching:
                 if self.contacts.touched[i] > 0:
                     self.touched[self.patch[i]] = 1
 
-    @ti.func
+    @function
     def sum_patches(self):
         """Centres and moments of the patches at the predicted positions."""
         for p in range(self.multi_count):
@@ -204,7 +204,7 @@ class ShapeMatching:
             self.predicted[k] = four(self.body.predicted[k])
             self.centre[p] = self.predicted[k]
 
-    @ti.func
+    @function
     def scatter(self):
         """Write the predicted positions."""
         for k in range(self.body.count):
@@ -228,7 +228,7 @@ class ShapeMatching:
         self.moment[p] = moment + scale.x * sums
         self.centre[p] = centre + scale.y * total
 
-    @ti.func
+    @function
     def fit(self, from_scratch: ti.template()):
         """Least-squares rigid frames of the clusters (Eq. 8), from their last rotations or from scratch.
 
@@ -272,7 +272,7 @@ class ShapeMatching:
         rest = self.patch_rest[p]
         return rest - centre0, rest.w * (self.centre[p] - reference)
 
-    @ti.func
+    @function
     def average(self):
         """Averaged frame of each patch's clusters: the mean of R_c x0 + T_c is (mean R_c) x0 + mean T_c (Eq. 7)."""
         for p in range(self.patch_count):
@@ -283,7 +283,7 @@ class ShapeMatching:
             origin = row(frame, 3) + centre.x * x + centre.y * y + centre.z * z
             self.goal[p] = self.patch_scale[p].z * ti.Matrix.rows([x, y, z, origin])
 
-    @ti.func
+    @function
     def move_to_goals(self, step: float):
         """Move each predicted position by ``step`` times the averaged displacement to its goals (Eqs. 9 and 12)."""
         for p in range(self.multi_count):
@@ -304,7 +304,7 @@ class ShapeMatching:
             self.predicted[k] = keep * self.predicted[k] + step * row(self.goal[p], 3)
             self.centre[p] = self.predicted[k]
 
-    @ti.func
+    @function
     def push_out(self, relaxation_factor: float):
         """Push particles that touch a shape out of it."""
         for p in range(self.patch_count):

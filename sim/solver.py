@@ -12,7 +12,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from sim import fields
 from sim.body import BodyState
 from sim.fields import array_of, fill, fill_evenly
-from sim.kernels import kernel
+from sim.kernels import function, kernel
 from sim.self_contact import SelfContacts
 from sim.shapes import MOST_SUBSTEPS, ConvexTool
 from sim.tissue_model import TissueModel
@@ -61,6 +61,7 @@ class Solver:
     ) -> None:
         self.body: Any = model.body
         self.model = model
+        self.serial = model.serial
         self.contacts: Any = model.contacts
         self.self_contacts = self_contacts
         self.tool = tool
@@ -86,7 +87,7 @@ class Solver:
         iterations = settings.iterations
         for substep in range(settings.substeps):
             self.start_substep(substep, *start)
-            if self.model.serial:
+            if self.serial:
                 self.iterate(iterations, settings.stiffness, settings.relaxation_factor, dt)
             else:
                 for iteration in range(iterations):
@@ -133,7 +134,7 @@ class Solver:
     ):
         """The start of a substep: on one core for bodies so small that starting threads takes longer than they save, as the kernels below."""
         gravity = tm.vec3(gravity_x, gravity_y, gravity_z)
-        if ti.static(self.model.serial):
+        if ti.static(self.serial):
             ti.loop_config(serialize=True)
             for _ in range(1):
                 self.start(substep, dt, gravity, damping, stabilisation_iterations)
@@ -143,7 +144,7 @@ class Solver:
     @kernel
     def iterate(self, iterations: int, stiffness: float, relaxation_factor: float, dt: float):
         """All iterations of a substep on one core, or the next one on all cores: only outermost loops run in parallel."""
-        if ti.static(self.model.serial):
+        if ti.static(self.serial):
             ti.loop_config(serialize=True)
             for iteration in range(iterations):
                 self.correct(stiffness, relaxation_at(iteration, iterations, relaxation_factor), dt)
@@ -153,7 +154,7 @@ class Solver:
     @kernel
     def finish_substep(self, dt: float):
         """The end of a substep."""
-        if ti.static(self.model.serial):
+        if ti.static(self.serial):
             ti.loop_config(serialize=True)
             for _ in range(1):
                 self.finish(dt)
@@ -207,7 +208,7 @@ class Solver:
             self.contacts.finish()
         self.update_velocities(dt)
 
-    @ti.func
+    @function
     def update_velocities(self, dt: float):
         """Lines 24 and 25."""
         for i in range(self.body.count):

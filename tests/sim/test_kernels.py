@@ -8,7 +8,7 @@ import pytest
 import taichi as ti
 
 from sim.fields import Field, array_of, field_of, fill, zeros
-from sim.kernels import kernel
+from sim.kernels import function, kernel
 
 Numbers = ti.types.ndarray(ti.f32, ndim=2)
 
@@ -214,3 +214,59 @@ def test_fields_of_other_kinds_are_other_kernels(device):
     # Integers are cut off.
     assert compiled(thing.add) == count + 1 and array_of(thing.values).tolist() == [2, 3, 4]
     fill((thing.values, np.zeros(3)))
+
+
+TURN = ti.Matrix([[0.0, -1.0, 0.5], [1.0, 0.0, 0.25], [0.0, 0.5, 1.0]])
+
+
+class Turned:
+    """Points moved as a whole by a method that is a function of the compiled code, or a part of it."""
+
+    def __init__(self, points: np.ndarray, serial: bool) -> None:
+        self.points, self.serial = field_of(points, 1), serial
+        self.turn, self.offset = TURN, ti.Vector([3.0, -2.0, 0.5])
+        self.factor = zeros()
+        self.part = Plain(np.arange(3.0), shift=0.5)
+        fill((self.factor, np.array(2.0)))
+
+    @function
+    def move(self, first, by: float, twice: ti.template()):
+        for i in range(first, self.points.shape[0]):
+            self.points[i] = by * self.factor[None] * (self.turn @ self.points[i]) + self.offset
+            if ti.static(twice):
+                self.points[i] += self.part.added()
+        self.double()
+
+    @function
+    def double(self):
+        for _ in range(1):
+            self.factor[None] = 2.0 * self.factor[None]
+
+    @kernel
+    def run(self, first: int, by: float):
+        if ti.static(self.serial):
+            for _ in range(1):
+                self.move(first, by, False)
+                self.move(first + 1, 0.5 * by, True)
+        else:
+            self.move(first, by, False)
+            self.move(first + 1, 0.5 * by, True)
+
+
+@pytest.mark.parametrize("serial", [True, False])
+def test_a_function_has_fields_numbers_and_matrices_of_its_object(device, serial):
+    points = np.random.default_rng(3).normal(size=(7, 3)).round(2)
+    moved = Turned(points, serial)
+    turn, offset = np.array(moved.turn.to_list()), np.array(moved.offset.to_list())
+    moved.run(2, 1.5)
+    wanted = points.copy()
+    wanted[2:] = 1.5 * 2 * wanted[2:] @ turn.T + offset
+    wanted[3:] = 0.75 * 4 * wanted[3:] @ turn.T + offset + 0.75
+    assert array_of(moved.points) == pytest.approx(wanted, abs=1e-4)
+    assert array_of(moved.factor) == 8.0
+    count = compiled(moved.run)
+    moved.part.shift, moved.offset = -0.25, ti.Vector([0.0, 0.0, 0.0])
+    moved.run(6, 1.0)
+    wanted[6] = 8 * turn @ wanted[6]
+    assert array_of(moved.points) == pytest.approx(wanted, abs=1e-3)
+    assert compiled(moved.run) == count
