@@ -88,7 +88,7 @@ class function:
             return
         runtime = impl.get_runtime()
         within = runtime.compiling_callable
-        key = core.FunctionKey(self.__name__, self._inline.func_id, next(self._numbers))
+        key = core.FunctionKey(self._inline.func.__name__, self._inline.func_id, next(self._numbers))
         compiled = runtime.prog.create_function(key)
         trace = _Trace(_declared_in_function)
         compiled.set_function_body(lambda: self._read(compiled, trace, owner, given))
