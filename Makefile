@@ -1,4 +1,5 @@
 # make run       press the embedded patient's kidney, in a window or, without a display, into out/
+# make gpu       measure on each graphics card, in at most eight minutes, into out/gpu
 # make test      everything that must hold before a change lands
 # make lint      the part of it that reads the code and runs nothing
 # make audit     whether anything pinned here is known to be vulnerable, as PyPI knows it
@@ -23,11 +24,14 @@ ARGS ?=
 # Packages of both kinds are installed at the same time; and the embedded patient is made while the code is checked.
 MAKEFLAGS += --jobs=2
 
-.PHONY: run test lint driver screen audit licences clean
+.PHONY: run gpu test lint driver screen audit licences clean
 .DELETE_ON_ERROR:
 
 run: driver .venv/.patient
 	$(BIN)/python app.py rehearse $(ARGS)
+
+gpu: driver .venv/.patient
+	$(BIN)/python app.py study gpu --out out/gpu $(ARGS)
 
 test: screen .venv/.patient lint
 	$(BIN)/python -m pytest -n 2 --dist worksteal

@@ -94,7 +94,7 @@ class function:
         compiled.set_function_body(lambda: self._read(compiled, trace, owner, given))
         runtime.compiling_callable = runtime.current_kernel.kernel_cpp = within
         passed = [each for each in given if isinstance(each, Expr)]
-        callers, _, _ = owner._traced
+        callers, _, _ = owner.traced
         callers.constants += trace.constants
         for path, value in trace.arguments:
             passed += _passed(callers.value(path, value))
@@ -104,7 +104,7 @@ class function:
         """Have Taichi read the code into the compiled function."""
         runtime = impl.get_runtime()
         runtime.compiling_callable = runtime.current_kernel.kernel_cpp = compiled
-        _, path, value = owner._traced
+        _, path, value = owner.traced
         own = [_like(each) if isinstance(each, Expr) else each for each in given]
         self._inline(trace.value(path, value), *own)
         # The trace has added arguments.
@@ -218,7 +218,7 @@ class _Trace:
         return self._found[path]
 
     def _value(self, path: str, value: Any) -> Any:
-        if isinstance(value, CONSTANTS):
+        if isinstance(value, CONSTANTS) or (has_constant_counts() and isinstance(value, int)):
             self.constants.append((path, value))
             return value
         if isinstance(value, list | tuple):
@@ -240,10 +240,10 @@ class _TracedObject:
     """Stands for an object while Taichi reads the code of a kernel."""
 
     def __init__(self, trace: _Trace, path: str, value: Any) -> None:
-        self._traced = trace, path, value
+        self.traced = trace, path, value
 
     def __getattr__(self, name: str) -> Any:
-        trace, path, value = self._traced
+        trace, path, value = self.traced
         method = getattr(type(value), name, None)
         if isinstance(method, FunctionType | function):
             return MethodType(method, self)
@@ -254,22 +254,23 @@ class _TracedField:
     """Stands for a field while Taichi reads the code of a kernel."""
 
     def __init__(self, trace: _Trace, path: str, field: Field) -> None:
-        self._traced, self._element = (trace, path, field), field.element
+        self.traced, self._element = (trace, path, field), field.element
 
     @functools.cached_property
-    def _array(self) -> Any:
+    def array(self) -> Any:
         # A template parameter exists before Taichi takes arguments.
-        trace, path, field = self._traced
+        trace, path, field = self.traced
         return trace.declared(path, field)
 
     @property
-    def shape(self) -> list[Expr]:
+    def shape(self) -> Any:
         """Lengths of the axes."""
-        return self._array.shape
+        trace, path, field = self.traced
+        return trace.value(f"{path}.shape", field.shape) if has_constant_counts() else self.array.shape
 
     def __getitem__(self, at: Any) -> Expr:
         at = 0 if at is None else at
-        element = impl.subscript(None, self._array, *(at if isinstance(at, tuple) else (at,)))
+        element = impl.subscript(None, self.array, *(at if isinstance(at, tuple) else (at,)))
         return _TracedElement(element.ptr, self._element) if self._element else element
 
 
@@ -285,6 +286,11 @@ class _TracedElement(Expr):
         places = [make_expr_group(*index) for index in np.ndindex(*self._shape)]
         whole = core.subscript_with_multiple_indices(self.ptr, places, self._shape, core.DebugInfo(""))
         return ops.assign(Expr(whole), value)
+
+
+def has_constant_counts() -> bool:
+    """Whether whole numbers of objects are compiled too: Vulkan starts 65,536 threads for a loop whose range it does not know."""
+    return ti.cfg.arch == ti.vulkan
 
 
 def _reader(paths: list[str]) -> Callable[[tuple], tuple]:
@@ -334,7 +340,7 @@ def _like(number: Expr) -> Expr:
 def _passed(argument: Any) -> list[Any]:
     """What passes a caller's argument on to a function: lengths and address of a field, the numbers of a matrix."""
     if isinstance(argument, _TracedField):
-        return core.get_external_tensor_real_func_args(argument._array.ptr, core.DebugInfo(""))
+        return core.get_external_tensor_real_func_args(argument.array.ptr, core.DebugInfo(""))
     return impl.get_runtime().compiling_callable.ast_builder().expand_exprs([argument.ptr])
 
 

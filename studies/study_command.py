@@ -14,6 +14,7 @@ STUDIES = {
         "studies.performance.frame_rate:frames",
         "Measure pictures a second, pace and latency of SCENE in a window.",
     ),
+    "gpu": ("studies.gpu.gpu_command:gpu", "Measure step, picture and frame on each graphics card."),
     "trade": (
         "studies.performance.tradeoff:trade",
         "Measure the error of beads against the time of a step.",

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
+from sim import kernels
 from sim.fields import Field, array_of, field_of, fill, zeros
 from sim.kernels import function, kernel
 
@@ -270,3 +271,28 @@ def test_a_function_has_fields_numbers_and_matrices_of_its_object(device, serial
     wanted[6] = 8 * turn @ wanted[6]
     assert array_of(moved.points) == pytest.approx(wanted, abs=1e-3)
     assert compiled(moved.run) == count
+
+
+def test_where_counts_are_compiled_another_count_is_another_kernel(device, monkeypatch):
+    monkeypatch.setattr(kernels, "has_constant_counts", lambda: True)
+    owners = [Counted(3, 0.5), Counted(5, 0.5), Counted(5, 2.0)]
+    for owner in owners:
+        owner.add()
+    assert [array_of(each.values).tolist() for each in owners] == [[3.5] * 3, [5.5] * 5, [7.0] * 5]
+    owners[1].count = 2
+    owners[1].add()
+    assert array_of(owners[1].values).tolist() == [11.0] * 2 + [5.5] * 3
+    # Of the three counts, and not of the number that is no count.
+    assert compiled(owners[0].add) == 3
+
+
+class Counted:
+    """Adds a number and the length of its field to each of its first values."""
+
+    def __init__(self, count: int, more: float) -> None:
+        self.count, self.more, self.values = count, more, zeros(count)
+
+    @kernel
+    def add(self):
+        for i in range(self.count):
+            self.values[i] += self.more + self.values.shape[0]
