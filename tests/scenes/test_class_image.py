@@ -28,6 +28,7 @@ from ultrasound.acoustics import tissue_table
 
 # Voxels that a class image divides along two axes.
 SPACING = (2.5, 1.5, 4.0)
+pytestmark = pytest.mark.usefixtures("arrays_stored")
 
 
 def test_what_was_changed_is_named_by_its_volume_the_largest_first():
