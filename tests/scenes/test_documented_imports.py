@@ -44,7 +44,7 @@ def clinic(tmp_path_factory):
     folder = tmp_path_factory.mktemp("clinic")
     (folder / "ct").mkdir()
     (folder / "segmentations").mkdir()
-    empty = grid_around((-175, -120, -90), (175, 120, 90), (3.0, 3.0, 3.0))
+    empty = grid_around((-175, -120, -60), (175, 120, 70), (3.4, 3.4, 3.4))
     ct = drawn(empty, (-90, BODY), (60, MUSCLE), (120, LEFT), (120, RIGHT), (70, TUMOUR), (260, BRIGHT))
     for name in ("ct.nii.gz", "ct/ct.nii.gz"):
         write(ct, folder / name)
