@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from skimage.color import rgb2lab
-from synthetic_body import LEFT, TUMOUR, coarsely, points_of
+from synthetic_body import LEFT, TUMOUR, coarsely, points_of, without_picture
 from test_dense_findings import ENHANCED_HU, KIDNEY, THIN, made, organ
 from test_field_cases import SPINE, inside, scan, slicer, written
 
@@ -114,6 +114,7 @@ def test_a_segmentation_as_3d_slicer_writes_it(tmp_path):
 def coarse():
     with pytest.MonkeyPatch.context() as patch:
         coarsely(patch)
+        without_picture(patch)
         yield
 
 

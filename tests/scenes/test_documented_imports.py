@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from conftest import ROOT
-from synthetic_body import BODY, LEFT, RIGHT, TUMOUR, coarsely, drawn, grid_around
+from synthetic_body import BODY, LEFT, RIGHT, TUMOUR, coarsely, drawn, grid_around, without_picture
 
 from app import main
 from scenes.import_findings import read_findings
@@ -56,6 +56,7 @@ def clinic(tmp_path_factory):
         write(drawn(empty, (1, solid)), folder / "segmentations" / f"{name}.nii.gz")
     with pytest.MonkeyPatch.context() as patch:
         coarsely(patch)
+        without_picture(patch)
         patch.chdir(folder)
         exec(virtual_tumour())
         assert main([*words_of("import ct kidneys.nii.gz --organ 1,2 --side left"), "--out", "bed"]) == 0
