@@ -34,6 +34,8 @@ from sim.device import start
 from ultrasound.probe_manipulator import advanced, image_plane
 from ultrasound.sweep_file import read_sweep
 
+pytestmark = pytest.mark.usefixtures("arrays_stored")
+
 
 class SlowMachine(Pace):
     """Each step takes longer than the longest one simulates."""

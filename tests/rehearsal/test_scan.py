@@ -26,6 +26,8 @@ from scenes.surfaces import load_surface
 from ultrasound.probe import load_probe
 from version import VERSION
 
+pytestmark = pytest.mark.usefixtures("arrays_stored")
+
 
 def pose_on_tumour() -> np.ndarray:
     """On the embedded kidney's tumour: y into it, x to the head."""
