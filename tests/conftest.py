@@ -85,6 +85,14 @@ def kept(one_device) -> Callable:
     return keep
 
 
+@pytest.fixture(scope="module")
+def arrays_stored(tmp_path_factory) -> Iterator[None]:
+    """For files in which the same organ is built again and again, and no two computations are compared: its arrays are stored, as in use."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stored_arrays, "FOLDER", tmp_path_factory.getbasetemp() / "arrays")
+        yield
+
+
 @pytest.fixture
 def nothing_built() -> Iterator[None]:
     """What tasks build in this process is of a Taichi that the next test starts anew."""

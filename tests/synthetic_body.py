@@ -32,6 +32,14 @@ def coarsely(patch):
     patch.setattr("scenes.patients.organ_support.GRID_MM", 3.0)
 
 
+def without_picture(patch):
+    """While a patch lasts, an import leaves an empty check.png: it is tested by itself, and takes a second to draw."""
+    patch.setattr(
+        "scenes.patients.check_picture.draw_check",
+        lambda patient, rows, folder: (folder / "check.png").touch(),
+    )
+
+
 def level(points, solid):
     """(|p - c| / a) - 1 of an ellipsoid; negative inside."""
     centre, axes = solid

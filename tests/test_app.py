@@ -29,6 +29,7 @@ from rehearsal.commands.command_line import CommandError
 from rehearsal.commands.rehearse_command import why_no_display
 from rehearsal.commands.rehearse_options import RehearseOptions
 from render.display import X11Screen
+from render.window import NoVulkan
 from studies.study_command import STUDIES
 from version import VERSION
 
@@ -138,14 +139,18 @@ def test_a_display_that_does_not_answer_is_named(monkeypatch):
     assert why_no_display() == "DISPLAY is :4242, which does not answer"
 
 
-def test_without_vulkan_it_says_so_in_one_line_and_options_reach_the_solver(tmp_path):
-    nowhere = "/nonexistent"
+def test_without_vulkan_it_says_so_in_one_line_and_options_reach_the_solver(tmp_path, monkeypatch, capsys):
+    """That a machine has none is found in tests/render/test_render.py."""
+
+    def no_driver(*_, **__):
+        raise NoVulkan("no Vulkan driver found")
+
+    monkeypatch.setattr("rehearsal.headless.open_viewer", no_driver)
     steps = "--substeps", "2", "--iterations", "5", "--stiffness", "0.7"
-    driver = dict(VK_ICD_FILENAMES=nowhere, VK_DRIVER_FILES=nowhere)
-    done = run("rehearse", "--headless", *PAPER, *steps, "--out", tmp_path, **driver)
-    assert done.returncode == 0, done.stderr
-    assert "No display" not in done.stdout and "as the options ask" in done.stdout
-    assert sum("no Vulkan driver" in line for line in done.stdout.splitlines()) == 1
+    assert app.main(["rehearse", "--headless", *PAPER, *steps, "--out", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    assert "No display" not in printed and "as the options ask" in printed
+    assert sum("no Vulkan driver" in line for line in printed.splitlines()) == 1
     assert list((tmp_path / "slices").glob("*.png")) and not list((tmp_path / "frames").glob("*.png"))
     report = json.loads((tmp_path / "report.json").read_text())
     assert (report["substeps"], report["iterations"], report["stiffness"]) == (2, 5, 0.7)
@@ -230,18 +235,17 @@ def test_a_module_that_catches_all_does_not_catch_ctrl_c(tmp_path, swallows):
 @pytest.mark.parametrize(
     ("encoding", "shown"), [("ascii", "Ω – µ".encode()), ("cp1252", b"\\u03a9 \x96 \xb5")]
 )
-def test_output_shows_what_its_encoding_lacks_in_another_form(volumes, tmp_path, encoding, shown):
+def test_output_shows_what_its_encoding_lacks_in_another_form(
+    volumes, tmp_path, monkeypatch, encoding, shown
+):
     named = shutil.copy(volumes[1], tmp_path / "Ω – µ.nrrd")
     nowhere = tmp_path / os.fsdecode(b"\xce\xa9 \xe9")
     for labels, status in ((named, 0), (nowhere, 2)):
-        done = subprocess.run(
-            [sys.executable, str(ROOT / "app.py"), "import", "--list", volumes[0], labels],
-            capture_output=True,
-            env=os.environ | {"PYTHONIOENCODING": encoding},
-            cwd=ROOT,
-        )
-        assert done.returncode == status and b"Traceback" not in done.stderr, done.stderr
-        assert shown in done.stdout if status == 0 else b"no such file" in done.stderr
+        for name in ("stdout", "stderr"):
+            monkeypatch.setattr(sys, name, io.TextIOWrapper(io.BytesIO(), encoding=encoding))
+        assert app.main(["import", "--list", str(volumes[0]), str(labels)]) == status
+        printed, told = (stream.flush() or stream.buffer.getvalue() for stream in (sys.stdout, sys.stderr))
+        assert shown in printed if status == 0 else b"no such file" in told
 
 
 @pytest.mark.parametrize("command", [("keys",), ("import", "--help")])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from dicom_series import Series, generate_uid, read_ct, save
-from synthetic_body import LEFT, RIGHT, TUMOUR, body, coarsely, drawn
+from synthetic_body import LEFT, RIGHT, TUMOUR, body, coarsely, drawn, without_picture
 
 import app
 from errors import UserError
@@ -97,6 +97,7 @@ def test_a_file_name_that_is_too_long_is_named_itself(tmp_path):
 def test_a_closed_stream_ends_nothing(volumes, tmp_path, monkeypatch, stream):
     """A service or a Windows program without a console starts the import: Python has no such stream."""
     coarsely(monkeypatch)
+    without_picture(monkeypatch)
     arguments = ["import", str(volumes / "ct.nii.gz"), str(volumes / "labels.nii.gz"), "--out"]
     options = ["--organ", "1,2", "--tumour", "3", "--side", "left"]
     monkeypatch.setattr(sys, stream, None)
@@ -382,6 +383,7 @@ def test_a_lesion_apart_from_the_kidney_is_not_left_out_in_silence(
 ):
     """A lesion of 2 ml that the user named, 20 mm beside the kidney: a warning or note says that it was left out."""
     coarsely(monkeypatch)
+    without_picture(monkeypatch)
     ct = sitk.ReadImage(str(volumes / "ct.nii.gz"))
     sitk.WriteImage(drawn(ct, (1, RIGHT), (2, LEFT), *solids), str(tmp_path / "labels.nii.gz"))
     files = [str(volumes / "ct.nii.gz"), str(tmp_path / "labels.nii.gz")]

@@ -81,6 +81,7 @@ def draw_perimysium(muscle: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
     noise = np.random.default_rng(SEED).standard_normal(cells, dtype=np.float32)
     noise = ndimage.gaussian_filter(noise, SHEETS_OVER_MM / 2 / (spacing_mm * step))
     there = refined(noise / max(float(noise.std()), 1e-6), step)[tuple(slice(n) for n in muscle.shape)]
-    along = coarse_distance(muscle, spacing_mm) % SHEETS_MM
-    sheet = np.abs(along - SHEETS_MM / 2) <= 0.5 * float(spacing_mm.mean())
-    return muscle & sheet & (there > SHEETS_ABOVE)
+    sheets = muscle & (there > SHEETS_ABOVE)
+    along = coarse_distance(muscle, spacing_mm)[sheets] % SHEETS_MM
+    sheets[sheets] = np.abs(along - SHEETS_MM / 2) <= 0.5 * float(spacing_mm.mean())
+    return sheets

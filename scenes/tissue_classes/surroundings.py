@@ -89,7 +89,7 @@ def _oral_agent(hu: np.ndarray, bone: np.ndarray, place: Place) -> np.ndarray:
         bright = piece & (hu[box] > DENSE_ABOVE_HU)
         if not bright.any():
             continue
-        middle = _middle(bright, np.ones(3)) + [axis.start for axis in box]
+        middle = _middle(bright, np.ones(3), [axis.start for axis in box])
         if place.of_indices(middle)[0, 1] < spine[1] - BEFORE_SPINE_MM:
             depth = ndimage.distance_transform_edt(np.pad(bright, 1), sampling=place.spacing_mm)
             if (depth > SHELL_MM).sum() > SOLID_SHARE * bright.sum():
@@ -151,19 +151,19 @@ def _bodies(hu: np.ndarray, soft: np.ndarray, bone: np.ndarray, place: Place) ->
     basins = watershed(-depth, seeds, mask=inside)
     spine = _spine(block_reduce(bone, tuple(step), np.mean) >= 0.5, step, place)
     names = ["soft-tissue"]
-    for n, peak in enumerate(peaks, 1):
-        own = basins == n
-        level = float(np.median(mean[own & (depth > depth[own].max() / 3)]))
-        at = place.of_indices(_middle(own, step))[0]
+    for n, (peak, box) in enumerate(zip(peaks, ndimage.find_objects(basins), strict=True), 1):
+        own, deep = basins[box] == n, depth[box]
+        level = float(np.median(mean[box][own & (deep > deep[own].max() / 3)]))
+        at = place.of_indices(_middle(own, step, [axis.start for axis in box]))[0]
         names.append(_body(level, float(depth[tuple(peak)]), at, spine, place.is_enhanced))
     found = np.array([("soft-tissue", *BODIES).index(name) for name in names])[basins]
     for code in (BODIES.index(name) + 1 for name in ("liver", "spleen")):
+        organ = found == code
+        if not organ.any():
+            continue
         # What no ball fits into is the wall of the abdomen beside it.
-        core = (found == code) & (depth > BODY_MM)
-        beside = (found == code) & (
-            ndimage.distance_transform_edt(~core, sampling=cell_mm) > BODY_MM + CELL_MM
-        )
-        found[beside] = BODIES.index("muscle") + 1
+        from_core = ndimage.distance_transform_edt(~(organ & (depth > BODY_MM)), sampling=cell_mm)
+        found[organ & (from_core > BODY_MM + CELL_MM)] = BODIES.index("muscle") + 1
     codes = repeated(found.astype(np.uint8), step, soft.shape)
     low, high = _fluid_hu(place.is_enhanced)
     # The opening leaves nothing of layers that soft tissue and fat have in common.
@@ -184,9 +184,9 @@ def _spine(bone: np.ndarray, step: np.ndarray, place: Place) -> np.ndarray | Non
     return None if middle is None else place.of_indices((middle[None] + 0.5) * step - 0.5)[0]
 
 
-def _middle(cells: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Return the index (1, 3) of the voxel, fractional, in the middle of a mask of cells."""
-    return (np.argwhere(cells).mean(axis=0)[None] + 0.5) * step - 0.5
+def _middle(cells: np.ndarray, step: np.ndarray, first: list[int]) -> np.ndarray:
+    """Return the index (1, 3) of the voxel, fractional, in the middle of a mask of cells, in a box whose first cell is given."""
+    return ((np.argwhere(cells) + first).mean(axis=0)[None] + 0.5) * step - 0.5
 
 
 def _body(

@@ -16,6 +16,8 @@ from rehearsal.sessions.session_file import Header
 from scenes.anatomy import Grid, LoadedAnatomy, load_anatomy
 from scenes.scene import EMBEDDED, Scene, SceneError, load_scene, scene_text, with_options
 
+pytestmark = pytest.mark.usefixtures("arrays_stored")
+
 KIDNEY_HU, FAT_HU = 35.0, -100.0
 
 

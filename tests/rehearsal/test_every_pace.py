@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import taichi as ti
 from coarse_patient import coarse_patient
 from null_viewer import NullViewer
 from plan_ball import plan_of, sweep_of
@@ -34,6 +33,8 @@ from sim.device import start
 from ultrasound.probe_manipulator import advanced, image_plane
 from ultrasound.sweep_file import read_sweep
 
+pytestmark = pytest.mark.usefixtures("arrays_stored")
+
 
 class SlowMachine(Pace):
     """Each step takes longer than the longest one simulates."""
@@ -50,14 +51,13 @@ def pace_at(level: int, kind: type[Pace] = Pace) -> Pace:
 
 
 @pytest.fixture(scope="module")
-def built() -> Iterator[tuple[Rehearsal, LoadedAnatomy]]:
+def built() -> tuple[Rehearsal, LoadedAnatomy]:
     start("cpu")
     rehearsal, anatomy = coarse_patient()
     # Kernels that the first frame would wait for.
     compile_picture(rehearsal)
     LiveMeasurements(rehearsal).watch(Session(rehearsal), rehearsal.probe)
-    yield rehearsal, anatomy
-    ti.reset()
+    return rehearsal, anatomy
 
 
 @pytest.fixture(scope="module")

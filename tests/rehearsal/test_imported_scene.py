@@ -31,6 +31,7 @@ VESSEL = np.array([45.0, 40.0, 12.0]), np.array([22.0, 4.0, 4.0])
 CYST = np.array([70.0, 20.0, -18.0]), np.array([12.0, 12.0, 12.0])  # sticks out, as the tumour
 NAMES = {3: "tumour", 4: "cyst", 5: "sinus", 6: "urine", 7: "vessel"}
 MOST_FORCE_N = 1.0
+pytestmark = pytest.mark.usefixtures("arrays_stored")
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,8 @@ from rehearsal.sessions.session import Session
 from scenes.scene import with_options
 from ultrasound.probe_manipulator import array_face_centre
 
+pytestmark = pytest.mark.usefixtures("arrays_stored")
+
 
 @pytest.fixture(scope="module")
 def built(one_device) -> Rehearsal:

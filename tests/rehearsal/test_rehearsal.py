@@ -28,6 +28,8 @@ from sim.signed_distance import signed_distance
 from sim.skinning import Skin
 from ultrasound.probe_manipulator import image_plane
 
+pytestmark = pytest.mark.usefixtures("arrays_stored")
+
 LOOK = ("both", "speckle", 350, 40)
 LOOK_AT_CT = ("ct", "speckle", 350, 40)
 CRLM = "crlm_1004", "crlm_1004_labels/kidneys_provisional.nii.gz"

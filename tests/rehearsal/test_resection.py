@@ -56,6 +56,8 @@ from scenes.surfaces import signed_distance_from
 from sim.fields import Field, array_of
 from ultrasound.probe_manipulator import advanced, pose_at, touching
 
+pytestmark = pytest.mark.usefixtures("arrays_stored")
+
 MARGIN_MM = 5.0
 # What the readers look for.
 KEYS = (

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import taichi as ti
 from coarse_patient import coarse_patient
 from null_viewer import NullViewer
 from one_step_solver import OneStepSolver
@@ -82,7 +81,6 @@ def built() -> Iterator[tuple[Rehearsal, LoadedAnatomy]]:
         # Every run begins with a new coverage of the one organ.
         patch.setattr(coverage, "distance_grid", once(coverage.distance_grid))
         yield coarse_patient()
-    ti.reset()
 
 
 def rewound(rehearsal: Rehearsal) -> Rehearsal:

@@ -23,7 +23,7 @@ ENHANCED = PLAIN | {"muscle": 65, "liver": 115, "spleen": 125, "kidney": 185, "v
 BONE, MARROW, BOWEL, BILE = 600, 170, 40, 5
 LEFT, RIGHT = np.array([68.0, 26.0, 0.0]), np.array([-68.0, 26.0, -6.0])
 HALF_AXES = np.array([25.0, 20.0, 46.0])
-LOW, HIGH = np.array([-174.0, -117.0, -72.0]), np.array([174.0, 117.0, 72.0])
+LOW, HIGH = np.array([-174.0, -117.0, -56.0]), np.array([174.0, 117.0, 56.0])
 NOISE_HU = 8.0
 
 

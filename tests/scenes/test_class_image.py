@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from skimage.color import rgb2lab
-from synthetic_body import LEFT, TUMOUR, coarsely, points_of
+from synthetic_body import LEFT, TUMOUR, coarsely, points_of, without_picture
 from test_dense_findings import ENHANCED_HU, KIDNEY, THIN, made, organ
 from test_field_cases import SPINE, inside, scan, slicer, written
 
@@ -28,6 +28,7 @@ from ultrasound.acoustics import tissue_table
 
 # Voxels that a class image divides along two axes.
 SPACING = (2.5, 1.5, 4.0)
+pytestmark = pytest.mark.usefixtures("arrays_stored")
 
 
 def test_what_was_changed_is_named_by_its_volume_the_largest_first():
@@ -113,6 +114,7 @@ def test_a_segmentation_as_3d_slicer_writes_it(tmp_path):
 def coarse():
     with pytest.MonkeyPatch.context() as patch:
         coarsely(patch)
+        without_picture(patch)
         yield
 
 

@@ -1,6 +1,7 @@
 """What an import says of contrast agent and stones, against what the tissue map shows of the same patients."""
 
 import re
+from functools import cache
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from synthetic_body import LEFT, grid_around, level, points_of
 from scenes.patients.dense_findings import dense_findings
 from scenes.tissue_classes.collecting_system import DENSE_ABOVE_HU, LARGEST_STONE_ML
 from scenes.tissue_classes.kidney_parts import ENHANCED_FROM_HU
-from scenes.tissue_classes.tissue_map import codes_of_labels, tissue_map
+from scenes.tissue_classes.tissue_map import TissueMap, codes_of_labels, tissue_map
 from scenes.volumes.voxel_grid import VoxelGrid
 
 FAT_HU, ENHANCED_HU, UNENHANCED_HU, BRIGHT_HU = -100.0, 150.0, 35.0, 600.0
@@ -42,11 +43,22 @@ def made(spacing, kidney_hu, bright, labelled=None):
     return VoxelGrid.of(image), hu, coded
 
 
-def shown(grid, hu, coded) -> dict[str, float]:
-    """Volumes [ml] of what the tissue map shows, but for what is labelled so."""
+def mapped(grid, hu, coded) -> TissueMap:
     own = codes_of_labels(coded.transpose(2, 1, 0), TISSUES)
-    arrays = np.ascontiguousarray(hu.transpose(2, 1, 0), np.float32), own, organ(), grid.index_from_mm
-    found, bare = (tissue_map(*each) for each in (arrays, (np.full_like(arrays[0], FAT_HU), *arrays[1:])))
+    ct = np.ascontiguousarray(hu.transpose(2, 1, 0), np.float32)
+    return tissue_map(ct, own, organ(), grid.index_from_mm, draws=False)
+
+
+@cache
+def bare_of(spacing, labelled) -> TissueMap:
+    """What is shown where the CT has nothing but fat."""
+    return mapped(*made(spacing, FAT_HU, [], labelled))
+
+
+def shown(spacing, kidney_hu, bright, labelled) -> dict[str, float]:
+    """Volumes [ml] of what the tissue map shows, but for what is labelled so."""
+    found = mapped(*made(spacing, kidney_hu, bright, labelled))
+    bare = bare_of(spacing, None if labelled is None else tuple(map(tuple, labelled)))
     ml = float(np.prod(np.linalg.norm(np.linalg.inv(found.index_from_mm[:3, :3]), axis=0)) / 1000)
     return {each: ml * float((found.mask(each) & ~bare.mask(each)).sum()) for each in ("urine", "stone")}
 
@@ -66,7 +78,7 @@ def shown(grid, hu, coded) -> dict[str, float]:
 def test_an_import_says_what_the_tissue_map_shows(spacing, kidney_hu, bright, labelled, said):
     grid, hu, coded = made(spacing, kidney_hu, bright, labelled)
     warnings, note = dense_findings(grid, hu, coded, TISSUES, organ())
-    ml = shown(grid, hu, coded)
+    ml = shown(spacing, kidney_hu, bright, labelled)
     assert len(warnings) == len(said)
     for line, tissue in zip(warnings, said, strict=True):
         # One digit after the point.

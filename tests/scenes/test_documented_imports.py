@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from conftest import ROOT
-from synthetic_body import BODY, LEFT, RIGHT, TUMOUR, coarsely, drawn, grid_around
+from synthetic_body import BODY, LEFT, RIGHT, TUMOUR, coarsely, drawn, grid_around, without_picture
 
 from app import main
 from scenes.import_findings import read_findings
@@ -44,7 +44,7 @@ def clinic(tmp_path_factory):
     folder = tmp_path_factory.mktemp("clinic")
     (folder / "ct").mkdir()
     (folder / "segmentations").mkdir()
-    empty = grid_around((-175, -120, -90), (175, 120, 90), (3.0, 3.0, 3.0))
+    empty = grid_around((-175, -120, -60), (175, 120, 70), (3.4, 3.4, 3.4))
     ct = drawn(empty, (-90, BODY), (60, MUSCLE), (120, LEFT), (120, RIGHT), (70, TUMOUR), (260, BRIGHT))
     for name in ("ct.nii.gz", "ct/ct.nii.gz"):
         write(ct, folder / name)
@@ -56,6 +56,7 @@ def clinic(tmp_path_factory):
         write(drawn(empty, (1, solid)), folder / "segmentations" / f"{name}.nii.gz")
     with pytest.MonkeyPatch.context() as patch:
         coarsely(patch)
+        without_picture(patch)
         patch.chdir(folder)
         exec(virtual_tumour())
         assert main([*words_of("import ct kidneys.nii.gz --organ 1,2 --side left"), "--out", "bed"]) == 0

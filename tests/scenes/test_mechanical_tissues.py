@@ -16,6 +16,8 @@ from scenes.tissue import NeoHookeanTissue, PartName, Prony
 from sim.fields import array_of
 from sim.material import Material
 
+pytestmark = pytest.mark.usefixtures("arrays_stored")
+
 STIFF_TUMOUR = TABLE.parent / "stiff_tumour.toml"
 
 

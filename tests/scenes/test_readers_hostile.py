@@ -335,6 +335,13 @@ class TestArchives:
     def test_many_entries(self, tmp_path, refused, monkeypatch):
         monkeypatch.setattr(dicom_files, "MOST_FILES", 20)
         assert "has 21 files" in refused(archive(tmp_path / "a.zip", {f"{n}": b"" for n in range(21)}))
+        monkeypatch.setattr(dicom_files, "MOST_FILES", 5)
+        assert "more than 5 files" in refused(Series(tmp_path / "ct").write())
+
+    def test_many_large_entries(self, tmp_path, refused, monkeypatch, slice_bytes):
+        monkeypatch.setattr(dicom_files, "MOST_ARCHIVE_BYTES", 2 * len(slice_bytes))
+        many = archive(tmp_path / "a.zip", {f"{n}.dcm": slice_bytes for n in range(3)})
+        assert "GiB of DICOM; expected at most" in refused(many)
 
     def test_archive_in_an_archive(self, tmp_path, refused, slice_bytes):
         archive(tmp_path / "in.zip", {"b.dcm": slice_bytes})
@@ -357,7 +364,7 @@ class TestArchives:
         Series(tmp_path / "ct").write()
         path = zipped(tmp_path / "ct", tmp_path / "a.zip")
         path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
-        refused(path)
+        assert "a damaged archive" in refused(path)
 
     @pytest.mark.parametrize(
         ("name", "words"),

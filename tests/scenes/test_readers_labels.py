@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import nibabel
 import numpy as np
+import pydicom
 import pytest
 import SimpleITK as sitk
 from dicom_series import Series, refusal, write_segmentation, write_structures, zipped
@@ -313,6 +314,18 @@ def ring(centre, radius, direction, points=360):
     """A circle in the plane of a CT's slices."""
     turn = np.linspace(0, 2 * np.pi, points, endpoint=False)[:, None]
     return centre + radius * (np.cos(turn) * direction[:, 0] + np.sin(turn) * direction[:, 1])
+
+    def test_half_is_in(self, tmp_path):
+        """127 of 254."""
+        series, shares = Series(tmp_path / "ct"), np.zeros((6, 10, 12))
+        shares[1:4, 2:6, 2:6], shares[2, 3, 3] = 0.4, 0.5
+        data = pydicom.dcmread(
+            path := write_segmentation(tmp_path / "seg.dcm", series, {"Kidney": shares}, "FRACTIONAL")
+        )
+        data.PixelData, data.MaximumFractionalValue = data.PixelData.replace(b"\x80", b"\x7f"), 254
+        data.save_as(path)
+        found = by_name(open_labels(path).maps(None), ct_grid(series))["Kidney"]
+        assert np.array_equal(found, shares == 0.5)
 
 
 class TestContours:

@@ -4,7 +4,6 @@ import json
 import sys
 
 import pytest
-import taichi as ti
 
 import app
 from sim.device import start
@@ -29,8 +28,7 @@ pytest.importorskip("pymust")
 @pytest.fixture(scope="module", params=["drop-in", "phased"])
 def phantom(request):
     start("cpu")
-    yield request.param, EchoPhantom(load_probe(request.param))
-    ti.reset()
+    return request.param, EchoPhantom(load_probe(request.param))
 
 
 def test_widths_lengths_and_levels_are_within_the_bars_of_simus(phantom, monkeypatch):

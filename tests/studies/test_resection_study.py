@@ -26,6 +26,8 @@ from studies.resection.random_scores import KINDS, ScoredPatient, random_score
 from studies.resection.voxel_margins import VOXEL_MM, CutFigures, figures_by_voxels, signed_distance_map
 from studies.resection.voxel_solid import RasterGrid
 
+pytestmark = pytest.mark.usefixtures("arrays_stored")
+
 ORGAN = ball(R)
 FIGURES = CutFigures(3.0, 4.0, 100.0, 10.0, 0.0, 5.0)
 

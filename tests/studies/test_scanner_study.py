@@ -5,10 +5,8 @@ import json
 import numpy as np
 import pytest
 import SimpleITK as sitk
-import taichi as ti
 
 import app
-from sim.device import start
 from studies.echo.echo_phantom import EchoPhantom
 from studies.image_quality import RAYLEIGH_SNR
 from studies.scanner import grey_maps, recorded_speckle, ring_down, rotating_disc, wire_widths
@@ -35,13 +33,6 @@ pytest.importorskip("pymust")
 
 
 @pytest.fixture
-def taichi():
-    start("cpu")
-    yield
-    ti.reset()
-
-
-@pytest.fixture
 def recordings(data):
     """The folder of recordings."""
     if not (data / "us").is_dir():
@@ -65,7 +56,7 @@ def test_the_autocorrelation_is_that_of_a_turning_phase():
 
 
 class TestRotatingDisc:
-    def test_our_doppler_finds_a_known_rotation(self, taichi):
+    def test_our_doppler_finds_a_known_rotation(self, device):
         """IQ of scatterers everywhere whose phase turns by the rotation's axial velocity: 4 pi f v / (c PRF) from pulse to pulse."""
         data = channel_data()
         phantom = EchoPhantom(rotating_disc.probe_of(data))
@@ -119,7 +110,7 @@ class TestRotatingDisc:
         assert (grid_x[i], grid_z[j]) == pytest.approx((0.002, z), abs=1.5e-4)
         assert iq[i, j, 0] == pytest.approx(iq[i, j, 1])
 
-    def test_the_recorded_disc_turns_as_a_rigid_body(self, taichi, recordings):
+    def test_the_recorded_disc_turns_as_a_rigid_body(self, device, recordings):
         rotation = rotating_disc.rotation_of(read_channel_data(recordings / DISC))
         # An independent evaluation of the same file: 0.043 + 61.4 x + 0.2 z, median residual 8.6 mm/s.
         assert rotation.slope_per_s == pytest.approx(61.4, rel=0.02)
@@ -236,7 +227,7 @@ class TestGreyMaps:
 
 class TestCurvedArray:
     @pytest.fixture
-    def phantom(self, taichi):
+    def phantom(self, device):
         return EchoPhantom(recorded_speckle.probe_of(1740), 256)
 
     def test_our_scan_conversion_puts_samples_where_plus_does(self, phantom):

@@ -4,7 +4,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import taichi as ti
 import trimesh
 from conftest import rotation_about
 from particle_tissue import tissue_of
@@ -111,8 +110,6 @@ def flat_tank(voxel: float, **settings) -> Tank:
 @pytest.fixture(scope="module", autouse=True)
 def taichi():
     start("cpu")
-    yield
-    ti.reset()
 
 
 @pytest.fixture(scope="module")

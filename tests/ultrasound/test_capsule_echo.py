@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 from test_bmode import USUAL, Tank, depths, peaks, probe_of
 
 from sim.device import start
@@ -28,8 +27,6 @@ def distances(middle: float) -> np.ndarray:
 @pytest.fixture(scope="module", autouse=True)
 def taichi():
     start("cpu")
-    yield
-    ti.reset()
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 import trimesh
 from conftest import rotation_about
 from particle_tissue import tissue_of
@@ -59,8 +58,7 @@ class Vessel:
 @pytest.fixture(scope="module")
 def vessel():
     start("cpu")
-    yield Vessel()
-    ti.reset()
+    return Vessel()
 
 
 @pytest.mark.parametrize("angle", [20, 45, 60, 75, 120])

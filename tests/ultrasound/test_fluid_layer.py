@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 from pulse_oracle import loss_db
 from test_bmode import (
     FAT,
@@ -59,8 +58,6 @@ def below(x, y):
 @pytest.fixture(scope="module", autouse=True)
 def taichi():
     start("cpu")
-    yield
-    ti.reset()
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 from conftest import rotation_about
 from scipy import io, signal
 from test_bmode import BOUNDLESS, Tank, probe_of, speed_ratio
@@ -21,8 +20,7 @@ def tank():
     start("cpu")
     tank = Tank((BOUNDLESS,) * 3, (1, 1, 1), (0.0, 0.0, 0.0))
     tank.fill(1.5804, 0.0, 0.1)
-    yield tank
-    ti.reset()
+    return tank
 
 
 def plane_at(probe: Probe, at) -> ImagePlane:

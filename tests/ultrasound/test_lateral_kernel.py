@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 from test_bmode import GEOMETRIES, LINES, flat_tank, probe_of
 
 from sim.device import start
@@ -94,7 +93,6 @@ def test_scanlines_are_summed_by_their_weights_and_mirrored_at_the_arrays_ends()
     weights, half, _ = lateral_kernel(probe)
     assert half.max() > 8 and np.ptp(half) > 4
     real, imaginary = (array_of(each).astype(float) for each in (tank.bmode.real, tank.bmode.imaginary))
-    ti.reset()
     classes, side = scanline_classes(probe)
     packet = np.arange(real.shape[1]) // LANES
     scanlines = np.arange(LINES)

@@ -5,7 +5,6 @@ import re
 
 import numpy as np
 import pytest
-import taichi as ti
 import trimesh
 from pulse_oracle import loss_db
 from pydantic.alias_generators import to_pascal
@@ -238,8 +237,6 @@ def test_gain_is_the_sum_of_knob_course_and_sliders():
 @pytest.fixture(scope="module")
 def taichi():
     start("cpu")
-    yield
-    ti.reset()
 
 
 @pytest.fixture(scope="module")

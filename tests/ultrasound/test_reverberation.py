@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 from test_bmode import GAS, TISSUE, depths, flat_tank, peaks, probe_of, speed_ratio
 
 from sim.device import start
@@ -30,8 +29,7 @@ SILENT = 1e-9
 @pytest.fixture(scope="module")
 def tank():
     start("cpu")
-    yield flat_tank(0.5)
-    ti.reset()
+    return flat_tank(0.5)
 
 
 def level_of(tank, probe) -> np.ndarray:
