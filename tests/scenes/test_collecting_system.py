@@ -12,7 +12,6 @@ from scenes.tissue_classes.collecting_system import (
     LARGEST_STONE_ML,
     LEAST_PELVIS_ML,
     LEAST_SHARE,
-    LEAST_PELVIS_ML,
     PELVIS_MM,
     SMALL_ML,
     DensePieces,
