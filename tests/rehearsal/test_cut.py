@@ -6,7 +6,19 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import rotation_about
-from cut_ball import HEIGHT_MM, MARKS, RIM_MM, R, ball, cap_mm3, circle, inset, line_on_ball
+from cut_ball import (
+    HEIGHT_MM,
+    MARKS,
+    RIM_MM,
+    R,
+    ball,
+    cap_mm3,
+    circle,
+    cut_by,
+    half_space,
+    inset,
+    line_on_ball,
+)
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
@@ -14,13 +26,17 @@ from scipy.optimize import brentq
 from rehearsal.resection.cut import (
     STEEPEST,
     CutSettings,
+    _check_size,
+    check_hilum,
     cut_organ,
     faces_of,
     grown,
+    hilum_of,
     part_left,
 )
 from rehearsal.resection.proposal import line_around
 from rehearsal.resection.score_line import ResectionError, score_line
+from scenes.scene import Attachment
 from scenes.solids import solid_of, surface_of
 
 ORGAN = ball(R)
@@ -271,6 +287,35 @@ def test_a_cut_of_most_of_the_organ_is_refused():
     equator = score_line(ORGAN, circle(60, np.radians(80)))
     with pytest.raises(ResectionError, match=r"removes \d\d% of the organ, expected at most 50%"):
         cut_organ(ORGAN, equator, CutSettings("enucleation", depth_mm=25.0), np.zeros((0, 3)))
+
+
+def test_a_specimen_has_from_a_tenth_of_a_millilitre_to_half_of_the_organ():
+    for volume_mm3 in (100.1, 999.0):
+        _check_size(volume_mm3, 2000.0)
+    for volume_mm3, words in ((99.9, r"only 0\.10 ml"), (1001.0, "50% of the organ")):
+        with pytest.raises(ResectionError, match=words):
+            _check_size(volume_mm3, 2000.0)
+
+
+def test_the_hilum_is_the_ball_that_the_attachment_holds():
+    """Relative to an origin that is asymmetric, so that no axis can stand for another."""
+    hilum = hilum_of(Attachment(at_mm=(10.0, -20.0, 35.0), radius_mm=7.0), np.array([4.0, 5.0, -6.0]))
+    np.testing.assert_allclose(np.linalg.norm(hilum.vertices - [6.0, -25.0, 41.0], axis=1), 7.0)
+    assert hilum_of(Attachment(at_mm=None), np.zeros(3)) is None
+    assert hilum_of(Attachment(at_mm=(1.0, 2.0, 3.0), radius_mm=0.0), np.zeros(3)) is None
+
+
+@pytest.mark.parametrize("share", [0.24, 0.26])
+def test_a_cut_takes_at_most_a_quarter_of_the_tissue_around_the_hilum(share):
+    """All are boxes: a third of the hilum's is outside of the organ and does not count, so that its share is that of its height above the cut."""
+    organ = trimesh.creation.box([40.0, 44.0, 50.0])
+    hilum = trimesh.creation.box([12.0, 6.0, 20.0]).apply_translation([18.0, 3.0, -2.0])
+    made = cut_by(organ, half_space(8.0 - 20.0 * share))
+    if share < 0.25:
+        check_hilum(made, organ, hilum)
+    else:
+        with pytest.raises(ResectionError, match="removes 26% of the tissue around the hilum"):
+            check_hilum(made, organ, hilum)
 
 
 def test_a_part_loses_what_is_in_the_specimen():

@@ -21,6 +21,7 @@ from rehearsal.resection.judgement import (
     DividedVessel,
     Judgement,
     MarginMap,
+    _opened_mm2,
     diameter_of_section,
     divided_vessels,
     drawn_mm,
@@ -204,13 +205,25 @@ def fine(cut) -> trimesh.Trimesh:
     )
 
 
-def test_a_vessel_that_the_cut_only_grazes_is_none():
-    """Its section is less than what counts."""
+@pytest.mark.parametrize(("share", "counts"), [(0.9, False), (1.1, True)])
+def test_a_part_that_the_cut_only_grazes_is_not_opened(share, counts):
+    """Twelve faces of one area are inside a part, of which together they make a share of what counts."""
+    side = np.sqrt(share * LEAST_OPENED_MM2 / 6)
+    x, y = np.meshgrid(side * np.arange(11), side * np.arange(7), indexing="ij")
+    corner = np.arange(77).reshape(11, 7)
+    a, b, c, d = (
+        each.ravel() for each in (corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:])
+    )
+    faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    surface = trimesh.Trimesh(np.column_stack([x.ravel(), y.ravel(), np.zeros(77)]), faces, process=False)
+    # Three by two squares, from the fourth and the third on.
+    part = trimesh.creation.box(bounds=[[3 * side, 2 * side, -1.0], [6 * side, 4 * side, 1.0]])
+    assert len(divided_vessels(surface, part, None, {})) == counts
+    assert _opened_mm2(surface, part) == pytest.approx(share * LEAST_OPENED_MM2 * counts, rel=1e-9)
+
+
+def test_vessels_that_are_not_labelled_are_not_said_to_be_undivided():
     surface = fine(cut_by(ORGAN, half_space(6.0)))
-    grazing = ball(5.0, (0.0, 0.0, 6.0 - 5.0 + 0.01))
-    assert np.pi * 2 * 5.0 * 0.01 < LEAST_OPENED_MM2
-    assert divided_vessels(surface, grazing, None, {}) == ()
-    assert len(divided_vessels(surface, ball(5.0, (0.0, 0.0, 3.0)), None, {})) == 1
     assert divided_vessels(surface, None, None, {}) is None, "not labelled"
 
 

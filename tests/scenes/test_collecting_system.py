@@ -4,11 +4,13 @@ from itertools import permutations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from scenes.tissue_classes.collecting_system import (
     BESIDE_ABOVE_HU,
     DENSE_ABOVE_HU,
     LARGEST_STONE_ML,
+    LEAST_PELVIS_ML,
     LEAST_SHARE,
     PELVIS_MM,
     SMALL_ML,
@@ -120,6 +122,25 @@ def test_a_dilated_pelvis_without_contrast_agent_is_fluid_and_a_narrow_one_is_no
     # Blood and bowel beside it are no urine, nor is what does not reach the hollow.
     assert not pelvis_without_agent(hu + 60, PARENCHYMA, PARENCHYMA, outer, np.ones(3)).any()
     assert not pelvis_without_agent(hu, PARENCHYMA, PARENCHYMA, np.maximum(outer, 0.5), np.ones(3)).any()
+
+
+@pytest.mark.parametrize(("radius", "is_seen"), [(6.15, False), (6.7, True)])
+def test_a_pelvis_is_seen_from_a_volume_on(radius, is_seen):
+    """A ball in voxels that differ along each axis, each a cell of its own, so that distances are those of the voxels' centres."""
+    spacing = np.array([1.4, 1.5, 1.7])
+    places = AT * spacing
+    pelvis = np.linalg.norm(places - MIDDLE * spacing, axis=-1) <= radius
+    core = cKDTree(places[~pelvis]).query(places[pelvis])[0] >= PELVIS_MM
+    near = cKDTree(places[pelvis][core]).query(places[pelvis])[0] <= PELVIS_MM
+    # The ball that is sought fits into both; one has up to a fifth less than the least volume, the other more.
+    volume_ml = near.sum() * spacing.prod() / 1000
+    assert (
+        core.any() and abs(volume_ml / LEAST_PELVIS_ML - 1) < 0.2 and (volume_ml > LEAST_PELVIS_ML) == is_seen
+    )
+    hu = np.where(pelvis, 10.0, np.where(PARENCHYMA, ENHANCED, -90.0)).astype(np.float32)
+    parenchyma, outer = PARENCHYMA & ~pelvis, (AT[..., 0] - 30.0) * spacing[0]
+    found = pelvis_without_agent(hu, parenchyma, parenchyma, outer, spacing)
+    assert found.sum() == near.sum() * is_seen
 
 
 def test_a_dense_piece_outside_a_kidney_is_none_of_its():

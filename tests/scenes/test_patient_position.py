@@ -150,8 +150,8 @@ class Trunk:
         return self
 
     def with_level(self, gas_side: float = -1.0):
-        """A loop of bowel, half of it gas: the half in front, or with 1 that behind."""
-        self.slice[(np.hypot(self.x, self.y + 40) < 30) & (gas_side * (self.y + 40) > 0)] = -1000
+        """A loop of bowel, half of it gas, one HU thinner than lung may be: the half in front, or with 1 that behind."""
+        self.slice[(np.hypot(self.x, self.y + 40) < 30) & (gas_side * (self.y + 40) > 0)] = -901
         return self
 
     def with_round_gas(self):
@@ -163,8 +163,8 @@ class Trunk:
         return self
 
     def with_lungs(self):
-        """Their base is level, and is no fluid's."""
-        self.slice[(np.abs(np.abs(self.x) - 70) < 40) & (np.abs(self.y + 20) < 30)] = -850
+        """Their base is level, and is no fluid's; one HU denser than gas of bowel."""
+        self.slice[(np.abs(np.abs(self.x) - 70) < 40) & (np.abs(self.y + 20) < 30)] = -899
         return self
 
     def image(self, turns: int = 0) -> sitk.Image:
