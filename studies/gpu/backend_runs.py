@@ -9,10 +9,10 @@ from time import monotonic
 
 from rehearsal.worker_processes import end_with_parent
 from sim.device import NoDevice, start
-from studies.gpu.device_cases import CaseFigures, cases
+from studies.gpu.device_cases import Case, CaseFigures, cases
 
 END_S = 5.0
-CasesOf = Callable[[str], dict[str, Callable[[], Iterator[CaseFigures]]]]
+CasesOf = Callable[[str], dict[str, Case]]
 
 
 @dataclass

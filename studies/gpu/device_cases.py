@@ -49,10 +49,19 @@ class CaseFigures:
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
 
 
-def cases(arch: str) -> dict[str, Callable[[], Iterator[CaseFigures]]]:
+# Measures a case, or several.
+Case = Callable[[], Iterator[CaseFigures]]
+
+
+def cases(arch: str) -> dict[str, Case]:
     """What is measured on a backend, by name, in this order: what a rehearsal needs comes first, as time may run out."""
-    presses = {name: partial(press, name, setup) for name, setup in PRESSES.items()}
-    rehearsal = {"balanced": presses["balanced"], "B-mode": pictures, "frame": frames, "Doppler": doppler}
+    presses: dict[str, Case] = {name: partial(press, name, setup) for name, setup in PRESSES.items()}
+    rehearsal: dict[str, Case] = {
+        "balanced": presses["balanced"],
+        "B-mode": pictures,
+        "frame": frames,
+        "Doppler": doppler,
+    }
     return rehearsal | presses | {BLOCKS: partial(sizes, arch)}
 
 
