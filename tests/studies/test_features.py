@@ -11,6 +11,7 @@ from small_bead_case import briefly, small_anatomy
 import app
 from rehearsal.configuration import PRESETS, setup_of
 from sim.capsule import Capsule
+from sim.device import start
 from sim.particle_contact import ShapeContacts
 from sim.self_contact import SelfContacts
 from sim.shape_matching import ShapeMatching
@@ -63,7 +64,10 @@ def body_of(model: str) -> feature_costs.FeatureBody:
 
 @pytest.mark.parametrize("model", list(feature_costs.FEATURES))
 @pytest.mark.filterwarnings("ignore:.*Calling non-taichi function:SyntaxWarning")
-def test_what_is_off_is_not_compiled_and_not_allocated(device, monkeypatch, model):
+def test_what_is_off_is_not_compiled_and_not_allocated(monkeypatch, model):
+    # What other tests have compiled would not be compiled again.
+    ti.reset()
+    start("cpu")
     body = body_of(model)
 
     # Where one solver serves two features, what the first needs is what it has not compiled yet.
