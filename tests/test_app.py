@@ -244,8 +244,8 @@ def test_output_shows_what_its_encoding_lacks_in_another_form(
         for name in ("stdout", "stderr"):
             monkeypatch.setattr(sys, name, io.TextIOWrapper(io.BytesIO(), encoding=encoding))
         assert app.main(["import", "--list", str(volumes[0]), str(labels)]) == status
-        printed, told = (stream.flush() or stream.buffer.getvalue() for stream in (sys.stdout, sys.stderr))
-        assert shown in printed if status == 0 else b"no such file" in told
+        printed, errors = (stream.flush() or stream.buffer.getvalue() for stream in (sys.stdout, sys.stderr))
+        assert shown in printed if status == 0 else b"no such file" in errors
 
 
 @pytest.mark.parametrize("command", [("keys",), ("import", "--help")])
