@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rehearsal.commands.command_line import load_patient
-from rehearsal.configuration import PRESETS, Setup, setup_of
+from rehearsal.configuration import PRESETS, Setup
 from rehearsal.result_files import spread
 from rehearsal.stopwatch import timed
 from scenes.scene import EMBEDDED
 from studies.accuracy.bead_case import load_case
-from studies.performance.step_timing import COUNTS, STEPS, blocks
+from studies.performance.step_timing import COUNTS, PAPERS, STEPS, blocks
 from studies.performance.tradeoff import EMBEDDED_CASE
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ BEND_MM, WAVE_MM = 2.0, 40.0
 MOST_MS = {"balanced": 1.0, "accurate": 4.0, "shape matching 2.2 mm": 1.0, "B-mode": 1.0}
 PRESSES: dict[str, Setup] = {
     **PRESETS["neo-hookean"],
-    "shape matching 2.2 mm": setup_of("shape-matching", radius_mm=2.2),
+    f"shape matching {PAPERS.size_mm:g} mm": PAPERS,
 }
 BLOCKS = "blocks at rest"
 

@@ -242,6 +242,8 @@ class Turned:
     def double(self):
         for _ in range(1):
             self.factor[None] = 2.0 * self.factor[None]
+            if ti.static(self.part.turns):
+                self.factor[None] = -self.factor[None]
 
     @kernel
     def run(self, first: int, by: float):
@@ -271,6 +273,12 @@ def test_a_function_has_fields_numbers_and_matrices_of_its_object(device, serial
     wanted[6] = 8 * turn @ wanted[6]
     assert array_of(moved.points) == pytest.approx(wanted, abs=1e-3)
     assert compiled(moved.run) == count
+    # A flag that only a function reads: two calls of it turn the sign twice, and what is between them once.
+    moved.part.turns = True
+    moved.run(6, 1.0)
+    wanted[6] = 32 * turn @ wanted[6]
+    assert array_of(moved.points) == pytest.approx(wanted, rel=1e-5, abs=1e-3)
+    assert array_of(moved.factor) == 128.0 and compiled(moved.run) == count + 1
 
 
 def test_where_counts_are_compiled_another_count_is_another_kernel(device, monkeypatch):
