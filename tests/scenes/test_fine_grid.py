@@ -13,6 +13,7 @@ from scenes.tissue_classes.fine_grid import (
     SURFACE_MM,
     SurfaceGrid,
     box_around,
+    coarse_distance,
     fine_factors,
     fine_index_from_mm,
     refined,
@@ -181,3 +182,16 @@ def test_distances_from_a_surface_are_those_of_its_place_in_any_grid(turn):
     whole = np.moveaxis(np.indices(shape), 0, -1)
     inside = np.linalg.norm((whole - to_index[:3, 3]) @ np.linalg.inv(to_index[:3, :3]).T, axis=-1) < 23.0
     assert inside[box].sum() == inside.sum()
+
+
+@pytest.mark.parametrize("spacing", [(0.8, 0.5, 1.0), (0.66, 1.0, 0.45)])
+def test_depth_by_cells_is_in_place(spacing):
+    """Below the surface of a ball, of which each of its voxels knows its depth; cells have two to four voxels along an axis."""
+    places = centres(spacing, extent_mm=59.0)
+    depth = coarse_distance(ball(places) < 0, np.array(spacing))
+    away = depth + ball(places)
+    inside = ball(places) < -1
+    # From centre to centre of cells it is up to half a cell more than from the surface; that is found to half a cell's diagonal.
+    assert np.abs(away[inside]).max() < 2.1 * (1 + np.sqrt(3)) / 2
+    assert 0 < away[inside].mean() < 2.1 / 2
+    assert places[depth >= 5].mean(axis=0) == pytest.approx(MIDDLE, abs=0.1)
