@@ -17,9 +17,9 @@ from dataclasses import dataclass, field
 import manifold3d
 import numpy as np
 import trimesh
-from matplotlib.path import Path
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as checked_dataclass
+from skimage.measure import points_in_poly
 
 from rehearsal.resection.score_line import ResectionError, ScoreLine, enclosed_by, places_on
 from render.viewer import Technique
@@ -178,8 +178,8 @@ def _cutter(
 
 def _bulge(enclosed: np.ndarray, outline: manifold3d.CrossSection) -> np.ndarray:
     """The triangles (n, 3, 3) of a surface that are beyond the line's outline by more than BESIDE_MM, along the axes of the line."""
-    around = Path(outline.offset(BESIDE_MM, manifold3d.JoinType.Round).to_polygons()[0])
-    seen = around.contains_points(enclosed[:, :, :2].reshape(-1, 2))
+    around = outline.offset(BESIDE_MM, manifold3d.JoinType.Round).to_polygons()[0]
+    seen = points_in_poly(enclosed[:, :, :2].reshape(-1, 2), around)
     return enclosed[~seen.reshape(-1, 3).all(axis=1)]
 
 
