@@ -209,6 +209,20 @@ def test_a_tumour_that_bulges_over_the_line_comes_with_the_specimen_whole(techni
     assert made.specimen.vertices[:, 2].max() == pytest.approx(57.0, abs=0.1)
 
 
+def test_a_tumour_wider_than_its_neck_is_cut_out_whole():
+    """A score in the neck, 1.5 mm narrower than the tumour on all sides."""
+    organ_mm, tumour_mm, neck_mm = 40.0, 13.0, 11.5
+    neck, centre = np.sqrt(organ_mm**2 - neck_mm**2), np.sqrt(tumour_mm**2 - neck_mm**2)
+    tumour = ball(tumour_mm, (0.0, 0.0, neck + centre), fine=3)
+    organ = surface_of(solid_of(ball(organ_mm, fine=3), "kidney") + solid_of(tumour, "tumour"))[0]
+    turn = 2 * np.pi * np.arange(24) / 24
+    marks = np.column_stack([neck_mm * np.cos(turn), neck_mm * np.sin(turn), np.full(24, neck)])
+    made = cut_organ(
+        organ, score_line(organ, marks), CutSettings("enucleoresection", 3.0), np.asarray(tumour.vertices)
+    )
+    assert np.abs(made.specimen.bounds[:, :2]).min() > tumour_mm - 0.1
+
+
 def test_what_hangs_on_the_specimen_alone_comes_with_it():
     """A knob on a thin stalk beside the score's middle: the cut of the stalk takes the knob."""
     stalk = trimesh.creation.cylinder(1.0, 8.0).apply_translation([0.0, 0.0, R + 3.0])

@@ -74,6 +74,12 @@ def test_the_velocity_is_that_of_the_doppler_equation(vessel, angle, speed_cm_s)
     assert doppler_shift_khz(probe, found) == pytest.approx(shift_khz, rel=0.05)
 
 
+def test_the_shift_of_a_velocity_is_twice_its_share_of_the_speed_of_sound():
+    """Of 5 MHz, at 50 cm/s in 1540 m/s."""
+    probe = probe_of(**SETTINGS | {"frequency_mhz": 5.0})
+    assert doppler_shift_khz(probe, 50.0) == pytest.approx(2 * 5e6 * 0.5 / 1540 / 1000, rel=1e-6)
+
+
 @pytest.mark.parametrize("steering", [-15.0, 12.0])
 def test_steered_scanlines_see_a_vessel_parallel_to_the_face(vessel, steering):
     vessel.tank.fill(backscatter=0.01)
