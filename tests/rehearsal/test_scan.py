@@ -160,7 +160,7 @@ def thinned_patient(*given) -> tuple[Scene, LoadedAnatomy]:
 
 
 def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys, monkeypatch):
-    # Blood flow of every other voxel takes ten seconds.
+    # Blood flow of every voxel takes seconds.
     monkeypatch.setattr(scan_command, "load_patient", thinned_patient)
     away, beyond = pose_on_tumour(), pose_on_tumour()
     away[:3, 3] -= 30 * away[:3, 1]

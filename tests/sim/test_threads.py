@@ -47,7 +47,7 @@ def rehearsed(threads: int) -> str:
     return hashlib.sha256(b"".join(each.tobytes() for each in arrays)).hexdigest()
 
 
-def test_a_rehearsal_gives_the_same_bits_after_another_start_with_more_threads(monkeypatch):
+def test_a_rehearsal_gives_the_same_bits_after_another_start_with_more_threads(arrays_stored, monkeypatch):
     for module in (neo_hookean, embedding):
         monkeypatch.setattr(module, "is_too_small", lambda *given: False)
     assert rehearsed(2) == rehearsed(4)

@@ -186,21 +186,6 @@ def test_rotation_continues(free):
     assert 1 - h * spin**2 * time_s < turned / (spin * time_s) < 1.0
 
 
-# Shape matching, with contacts of particles besides: in test_threads.
-@pytest.mark.parametrize("model", [m for m, tissue in TISSUES.items() if not tissue.supports_self_contact])
-def test_the_same_bits_for_any_number_of_threads(model):
-    found = []
-    for threads in (1, 2):
-        start("cpu", cpu_max_num_threads=threads)
-        ball = ball_of(model, True, serial=False)
-        # Nothing has moved yet, and nothing that is carried.
-        assert np.abs(array_of(ball.skin.vertices) - ball.mesh.vertices).max() < 10 * ROUNDING_MM
-        ball.press(ball.settings(G), 18.0, 13.0, 12)
-        found.append(ball.bits())
-        ti.reset()
-    assert found[0] == found[1]
-
-
 def test_a_restored_state_continues_with_the_same_bits(laid):
     settings = laid.settings(G)
     laid.press(settings, 18.0, 14.0, 10)

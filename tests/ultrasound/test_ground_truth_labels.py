@@ -151,7 +151,7 @@ def test_the_matrices_beside_a_picture_lead_to_where_its_pixels_were_at_rest(dev
     pixels = np.stack([column, row, 0 * row, 1 + 0 * row], axis=-1)
     places = pixels @ patient_from_pixels(rehearsal, probe, (PIXELS, PIXELS)).T
     # Float32 of 150 mm.
-    assert places[..., :3] == pytest.approx(plane.rest_grid(PIXELS) + rehearsal.origin, abs=1e-4)
+    np.testing.assert_allclose(places[..., :3], plane.rest_grid(PIXELS) + rehearsal.origin, atol=1e-4)
 
 
 def test_the_matrices_beside_a_picture_lead_to_what_it_shows(device):
