@@ -16,7 +16,7 @@ from skimage.measure import marching_cubes
 from errors import PatientError
 from scenes.patients.label_surfaces import FACES, decimate
 from scenes.patients.readers.label_maps import LabelMap, among, resample_nearest
-from scenes.surfaces import in_lps, load_surface, signed_distance_from, stated_space
+from scenes.surfaces import distances_on_grid, in_lps, load_surface, signed_distance_from, stated_space
 from scenes.volumes.voxel_grid import VoxelGrid
 
 # Spacing of the sampling grid.
@@ -265,9 +265,8 @@ def _distance_to_swept(surface: trimesh.Trimesh, grid: tuple[np.ndarray, ...]) -
     The distance to a union is the minimum of the distances to its parts, and a copy of the organ raised by t is as far from
     a point as the organ is from the point t lower: a running minimum along the upward axis.
     """
-    nodes = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1)
-    distance = signed_distance_from(surface, nodes.reshape(-1, 3))
-    return np.minimum.accumulate(distance.reshape(nodes.shape[:3]), axis=2)
+    low, counts = np.array([axis[0] for axis in grid]), tuple(len(axis) for axis in grid)
+    return np.minimum.accumulate(distances_on_grid(surface, low, counts, GRID_MM), axis=2)
 
 
 def _rounded_intersection(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:

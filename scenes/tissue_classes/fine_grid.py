@@ -9,12 +9,14 @@ import trimesh
 from scipy import ndimage
 from skimage.measure import block_reduce
 
-from scenes.surfaces import signed_distance_from
+from scenes.surfaces import distances_on_grid
 
 # Voxels are divided until they are no longer than this.
 LONGEST_MM = 1.7
 # Distances from the organ's surface are computed at this spacing, and interpolated.
 SURFACE_MM = 3.0
+# In the kidney each is exact, and so far from it; farther away the next are interpolated too.
+EXACT_MM = (-np.inf, 18.0)
 # Distances within large bodies are computed in cells of this size.
 CELL_MM = 2.0
 FAR_MM = 1e4
@@ -126,8 +128,7 @@ class SurfaceGrid:
     def __init__(self, surface: trimesh.Trimesh, margin_mm: float) -> None:
         self.low = surface.bounds[0] - margin_mm
         counts = np.ceil((np.ptp(surface.bounds, axis=0) + 2 * margin_mm) / SURFACE_MM).astype(int) + 1
-        points = self.low + SURFACE_MM * np.moveaxis(np.indices(counts), 0, -1)
-        self.distance = signed_distance_from(surface, points.reshape(-1, 3)).reshape(counts)
+        self.distance = distances_on_grid(surface, self.low, tuple(counts), SURFACE_MM, EXACT_MM)
 
     def at_voxels(self, values: np.ndarray, box: Box, index_from_mm: np.ndarray) -> np.ndarray:
         """Return values of this grid at the voxels of a box, float32, linear between points; of the nearest point outside the grid."""
