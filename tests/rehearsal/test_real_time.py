@@ -213,8 +213,10 @@ def test_ctrl_c_does_not_reach_the_process_while_it_loads(capfd, after_s):
 class ClockedLoop(SolverLoop):
     """A loop without tissue, whose steps take 10 ms; inputs come at given times, each 1 mm further."""
 
-    def __init__(self, monkeypatch, level: int, inputs_s: list[float], end_s: float) -> None:
-        self.now_s, self.begun = 0.0, []
+    def __init__(
+        self, monkeypatch, level: int, inputs_s: list[float], end_s: float, hangs_s: float = 0.0
+    ) -> None:
+        self.now_s, self.begun, self.hangs_s = 0.0, [], hangs_s
         monkeypatch.setattr("rehearsal.real_time.solver_loop.perf_counter", lambda: self.now_s)
         super().__init__(self, None)
         poses = [np.eye(4) + np.eye(4, k=3) * number for number in range(1, len(inputs_s) + 1)]
@@ -239,7 +241,8 @@ class ClockedLoop(SolverLoop):
 
     def timed_step(self, pose: np.ndarray, length_s: float, iterations: int) -> Step:
         self.begun.append((self.now_s, round(60 * length_s), pose[0, 3]))
-        self.now_s += 0.01
+        self.now_s += 0.01 + self.hangs_s
+        self.hangs_s = 0.0
         return Step(pose, length_s, iterations, 10.0)
 
     def snapshot_of_organ(self) -> None: ...
@@ -274,6 +277,15 @@ def test_short_steps_are_made_by_the_clock(monkeypatch):
     assert [at_s for at_s, _, _ in loop.begun] == pytest.approx([n / 60 for n in range(1, 7)])
     moved = CATCH_UP / 60 / 0.05
     assert [place for _, _, place in loop.begun] == pytest.approx([0.0, 0.0, moved, 2 * moved, 1.0, 1.0])
+
+
+def test_of_a_step_that_hangs_a_tenth_of_a_second_is_made_up_for(monkeypatch):
+    loop = ClockedLoop(monkeypatch, 0, [], end_s=2.0, hangs_s=1.0)
+    # A tenth of a second and a step are seven sixtieths, one after the other; then steps of 10 ms are made by the clock again.
+    made_up = [at_s for at_s, _, _ in loop.begun if 1.0 < at_s < 1.0 + 1 / 60 + 0.0701]
+    assert np.diff(made_up) == pytest.approx([0.01] * (len(made_up) - 1)) and len(made_up) == 7
+    simulated_s = sum(sixtieths for _, sixtieths, _ in loop.begun) / 60
+    assert simulated_s == pytest.approx(2.0 - (1.0 - 0.1), abs=0.03)
 
 
 class ScriptedPipe:
@@ -464,3 +476,6 @@ def test_rates_are_those_of_the_recent_frames(monkeypatch):
     assert list(times.latency_ms) == pytest.approx([50.0] * 11)
     times.restart()
     assert times.rates() == (0.0, 1.0)
+    with times.stage("image"):
+        clock[0] += 0.025
+    assert times.stages_ms["image"][-1] == pytest.approx(25.0)

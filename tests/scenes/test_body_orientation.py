@@ -52,6 +52,17 @@ def warnings(grid, hounsfield, flip, organ_z, labels=NO_LABELS):
     return orientation_warnings(_overview(turned, hounsfield), labels, midline, signs[2] * organ_z)
 
 
+def test_the_overview_has_the_voxels_nearest_to_15_tenths_of_a_mm_in_place():
+    spacing, origin = np.array([0.9, 0.6, 2.0]), np.array([-10.0, 5.0, 30.0])
+    grid = VoxelGrid((20, 30, 8), spacing, origin, np.eye(3))
+    hounsfield = np.random.default_rng(2).integers(-500, 500, (8, 30, 20)).astype(np.int16)
+    overview = _overview(grid, hounsfield)
+    # Between one and two, two and three, and none of each voxel.
+    assert overview.GetSpacing() == pytest.approx((1.8, 1.2, 2.0))
+    place = overview.TransformIndexToPhysicalPoint((3, 7, 5))
+    assert overview[3, 7, 5] == hounsfield[tuple(np.rint((place - origin) / spacing).astype(int)[::-1])]
+
+
 def check(found, flip):
     expected = [words for axis in ("y", "x", "z") if axis in flip for words in WORDS[axis]]
     assert len(found) == len(expected), found

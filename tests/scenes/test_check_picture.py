@@ -7,7 +7,9 @@ import matplotlib.image
 import numpy as np
 import pytest
 import SimpleITK as sitk
+import trimesh
 from ellipsoid_kidney import HALF_AXES, ball, kidney
+from matplotlib.figure import Figure
 from synthetic_body import LEFT, TUMOUR, body, coarsely, points_of, with_voxels
 
 from scenes.patients.check_picture import (
@@ -15,6 +17,8 @@ from scenes.patients.check_picture import (
     OVERVIEW,
     PIXEL_MM,
     VIEWS,
+    _draw_scale_bar,
+    _draw_surfaces,
     colours_of,
     draw_check,
     is_wider,
@@ -128,6 +132,33 @@ def longest_run(row) -> int:
     """Length of the longest run of true values."""
     ends = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(int)))
     return int((ends[1::2] - ends[::2]).max(initial=0))
+
+
+@pytest.mark.parametrize("extent", [(-30.0, 90.0, 60.0, -20.0), (40.0, 130.0, 200.0, 90.0)])
+def test_the_scale_bar_is_as_long_as_it_says_and_in_the_picture(extent):
+    axes = Figure().add_subplot()
+    _draw_scale_bar(axes, extent)
+    (bar,), (label,) = axes.lines, axes.texts
+    (start, end), (height, _) = bar.get_data()
+    assert label.get_text() == f"{end - start:g} mm" and start > (extent[0] + extent[1]) / 2
+    assert extent[1] - end == pytest.approx(0.05 * (extent[1] - extent[0]))
+    assert extent[2] - height == pytest.approx(0.05 * (extent[2] - extent[3]))
+
+
+@pytest.mark.parametrize(
+    "view, brightest", [("from the front", [-0.4, -0.8, 0.45]), ("from behind", [0.4, 0.8, 0.45])]
+)
+def test_surfaces_are_lit_from_above_and_from_the_viewers_side(view, brightest):
+    """Front is -y, and above z; shades are 0.35 and 0.65 times the cosine of the angle to the light."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=20.0)
+    axes = Figure().add_subplot(projection="3d")
+    _draw_surfaces(axes, view, {"organ": ball}, {"organ": (1.0, 1.0, 1.0)})
+    shade = axes.collections[0].get_facecolor()[:, 0]
+    light = np.array(brightest) / np.linalg.norm(brightest)
+    assert len(shade) == len(ball.faces) and shade.max() == pytest.approx(1.0, abs=0.01)
+    np.testing.assert_allclose(
+        np.sort(shade), np.sort(0.35 + 0.65 * np.clip(ball.face_normals @ light, 0, 1)), atol=1e-6
+    )
 
 
 def test_the_file_says_nothing_of_its_maker(patient, tmp_path):

@@ -124,6 +124,28 @@ def test_a_dilated_pelvis_without_contrast_agent_is_fluid_and_a_narrow_one_is_no
     assert not pelvis_without_agent(hu, PARENCHYMA, PARENCHYMA, np.maximum(outer, 0.5), np.ones(3)).any()
 
 
+@pytest.mark.parametrize(
+    "level, urine, is_seen",
+    [
+        (40.0, 14.0, True),
+        (40.0, 12.0, False),
+        (40.0, 31.5, True),
+        (40.0, 32.5, False),
+        (ENHANCED, -9.0, True),
+        (ENHANCED, -11.0, False),
+        (ENHANCED, 34.5, True),
+        (ENHANCED, 35.5, False),
+    ],
+)
+def test_urine_is_8_to_27_hu_darker_than_plain_parenchyma_and_minus_10_to_35_hu_beside_enhanced(
+    level, urine, is_seen
+):
+    pelvis = (np.linalg.norm(AT - [50.0, 25.0, 20.0], axis=-1) <= 8.0) & ~PARENCHYMA
+    hu = np.where(pelvis, urine, np.where(PARENCHYMA, level, -90.0)).astype(np.float32)
+    outer = np.where(KIDNEY, -1.0, 1.0 + np.abs(AT[..., 0] - 50))
+    assert pelvis_without_agent(hu, PARENCHYMA, PARENCHYMA, outer, np.ones(3)).any() == is_seen
+
+
 @pytest.mark.parametrize(("radius", "is_seen"), [(6.15, False), (6.7, True)])
 def test_a_pelvis_is_seen_from_a_volume_on(radius, is_seen):
     """A ball in voxels that differ along each axis, each a cell of its own, so that distances are those of the voxels' centres."""

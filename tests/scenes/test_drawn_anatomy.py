@@ -8,6 +8,8 @@ from scenes.tissue_classes.drawn_anatomy import (
     CORTEX_MM,
     LEAST_MM,
     MOST_MM,
+    SHEETS_ABOVE,
+    SHEETS_OVER_MM,
     draw_fascia,
     draw_perimysium,
     draw_pyramids,
@@ -111,4 +113,18 @@ def test_layers_of_muscle_are_thin_sheets_in_it():
     assert (
         layers.max() > 4 * np.median(layers[AT[0, :, 0, 1] > 2.0])
         or (layers[AT[0, :, 0, 1] > 2.0] == 0).mean() > 0.3
+    )
+
+
+def test_sheets_in_muscle_are_broken_as_noise_smoothed_over_4_mm_is():
+    """How often noise of a Gaussian correlation exp(-d^2 / (4 s^2)) crosses a level u: exp(-u^2 / 2) / (pi sqrt(2) s) (Rice 1945)."""
+    muscle = AT[..., 1] > 2.0
+    sheets = draw_perimysium(muscle, SPACING)
+    layer = sheets[:, sheets.sum(axis=(0, 2)).argmax()]
+    crossings = np.count_nonzero(np.diff(layer, axis=1)) / (
+        layer.shape[0] * (layer.shape[1] - 1) * SPACING[2]
+    )
+    # Noise has one value in a cell of about s, and is linear between: it crosses the level in fewer places, and by chance.
+    assert crossings == pytest.approx(
+        np.exp(-(SHEETS_ABOVE**2) / 2) / (np.pi * np.sqrt(2) * SHEETS_OVER_MM / 2), rel=0.3
     )

@@ -82,6 +82,24 @@ class TestFilled:
         (whole,) = [p for p in find_organs(label_map(thick[1]), ORGAN) if p.centre_x_mm > 0]
         assert piece.volume_ml == pytest.approx(whole.volume_ml, rel=0.01)
 
+    @pytest.mark.parametrize("is_first", [True, False])
+    def test_what_is_labelled_on_one_side_alone_is_the_tissue_between(self, is_first):
+        """Cortex below, medulla above, and a narrower section on one side: in its rim the slice between has the other side's value."""
+        voxels = np.zeros((9, 40, 40), np.uint8)
+        voxels[:4, 4:36, 4:36], voxels[5:, 4:36, 4:36] = 1, 2
+        narrow = np.s_[3 if is_first else 5]
+        voxels[narrow] = 0
+        voxels[narrow, 10:30, 4:36] = 1 if is_first else 2
+        grid = VoxelGrid((40, 40, 9), np.array([1.0, 1.0, 4.0]), np.zeros(3), np.eye(3))
+        found, warnings = fill_missing_slices(
+            LabelMap.valued(grid, voxels, {1: "cortex", 2: "medulla"}), ORGAN
+        )
+        assert "z 16.0 mm" in warnings[0]
+        between = found.values[4]
+        assert (between[12:28, 8:32] == 1).all()
+        rim = between[np.r_[6:9, 31:34]][:, 8:32]
+        assert rim.any() and set(np.unique(rim)) <= {0, 2 if is_first else 1}
+
     def test_a_tumour_alone(self, thick):
         voxels = sitk.GetArrayFromImage(thick[1])
         k = middle(thick[1], TUMOUR)

@@ -9,7 +9,7 @@ from test_patient_import import found, imported
 
 import scenes.patients.patient_import
 from errors import PatientError
-from scenes.patients.organ_selection import closing, find_organs, midline_x
+from scenes.patients.organ_selection import choose_organ, closing, find_organs, midline_x
 from scenes.patients.part_surfaces import PEDICLE_MM, colours_of_labels, near_organ, part_surface
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.label_maps import LabelMap, Segment
@@ -31,6 +31,25 @@ class TestOrgan:
         higher = np.array([sense * 120.0, 0.0, 80.0]), np.array([160.0, 110.0, 25.0])
         ct = sitk.GetArrayFromImage(drawn(empty, (40, BODY), (60, arm), (50, higher)))
         assert abs(midline_x(VoxelGrid.of(empty), ct, -40.0, 40.0)) < 10
+
+    @pytest.mark.parametrize(
+        "right_x, left_x, is_told", [(-45.0, 30.0, True), (20.0, 90.0, True), (1.0, 55.0, False)]
+    )
+    def test_without_a_body_two_kidneys_are_told_apart_by_their_distance(self, right_x, left_x, is_told):
+        """Farther than 60 mm they are two, with the midline between them; closer ones may be pieces of one."""
+        empty = grid_around((-80, -30, -60), (130, 90, 80), (4.0, 4.0, 4.0))
+        axes = np.array([14.0, 20.0, 40.0])
+        both = [(np.array([x, 30.0, 0.0]), axes) for x in (right_x, left_x)]
+        pieces = find_organs(LabelMap.of(drawn(empty, (1, both[0]), (1, both[1]))))
+        assert len(pieces) == 2
+        if is_told:
+            assert [choose_organ(pieces, None, side) for side in ("right", "left")] == [
+                (pieces[0], "right"),
+                (pieces[1], "left"),
+            ]
+        else:
+            with pytest.raises(PatientError):
+                choose_organ(pieces, None, "left")
 
     def test_island_is_no_organ(self):
         empty = grid_around((-110, -30, -60), (110, 90, 80), (3.0, 3.0, 3.0))

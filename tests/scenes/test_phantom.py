@@ -51,6 +51,27 @@ def test_grid_is_isotropic_lps_and_shared(phantom):
         assert getattr(ct, of)() == getattr(label_map, of)()
 
 
+# Voxels, and their mean place [mm].
+PARTS = {
+    Label.CORTEX: (161873, (63.67, 29.54, -327.46)),
+    Label.MEDULLA: (38272, (68.42, 31.69, -327.32)),
+    Label.SINUS: (16717, (59.15, 26.30, -328.76)),
+    Label.URINE: (9218, (59.48, 26.65, -330.86)),
+    Label.ARTERY: (2250, (57.85, 23.09, -331.16)),
+    Label.VEIN: (2958, (61.60, 22.91, -331.39)),
+    Label.TUMOUR: (10865, (84.07, 11.05, -344.30)),
+}
+
+
+def test_it_is_the_patient_of_the_documents(phantom, labels, hu):
+    """Figures of the documents were measured on it: who changes it measures them anew. A few voxels are rounding."""
+    for label, (count, place) in PARTS.items():
+        own = labels == label
+        assert own.sum() == pytest.approx(count, abs=4), label
+        assert _positions(own, phantom[1]).mean(axis=0) == pytest.approx(place, abs=0.015), label
+    assert hu.mean() == pytest.approx(-1.706, abs=0.01)
+
+
 def test_every_label_occurs_and_no_other(labels):
     assert set(np.unique(labels)) == set(Label)
 

@@ -178,6 +178,19 @@ class TestNifti:
         path = nifti(tmp_path / "ct.nii", noise(), [("s", 1), ("q", 1)], affines=both)
         assert "sform and qform differ by up to 30.0 mm" in refusal(path)
 
+    @pytest.mark.parametrize("direction", ["identity", "oblique"])
+    @pytest.mark.parametrize("apart_mm, is_one", [(0.45, True), (0.55, False)])
+    def test_forms_that_differ_by_less_than_half_a_voxel_are_one(self, tmp_path, direction, apart_mm, is_one):
+        """Voxels of 1.0 x 1.5 x 2.0 mm, moved by so much of the shortest: quaternions round."""
+        image = noise(DIRECTIONS[direction])
+        moved = affine_of(image)
+        moved[2, 3] += apart_mm
+        path = nifti(tmp_path / "ct.nii", image, affines=[affine_of(image), moved])
+        if is_one:
+            assert_same(open_ct(path), image)
+        else:
+            assert "sform and qform differ" in refusal(path)
+
     def test_no_orientation(self, tmp_path):
         assert "has no orientation" in refusal(nifti(tmp_path / "ct.nii", noise(), []))
 

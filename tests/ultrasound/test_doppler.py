@@ -11,6 +11,7 @@ from sim.body import BodyState
 from sim.device import start
 from sim.embedding import Embedding
 from sim.fields import array_of, fill
+from ultrasound.acoustics import BACKSCATTER, properties
 from ultrasound.blood_flow import BEAT_S, SYSTOLE_S
 from ultrasound.doppler import AWAY, BLOOD, POWER, STOPPED, TOWARDS, Doppler, doppler_shift_khz, noise_energy
 from ultrasound.lateral_kernel import MAX_HALF_WIDTH
@@ -72,6 +73,12 @@ def test_the_velocity_is_that_of_the_doppler_equation(vessel, angle, speed_cm_s)
     found = np.median(vessel.look(probe))
     shift_khz = 2 * probe.frequency_mhz * 1e3 * (speed_cm_s / 100) * np.cos(turn) / 1540
     assert doppler_shift_khz(probe, found) == pytest.approx(shift_khz, rel=0.05)
+
+
+def test_blood_echoes_as_a_vessel_in_the_b_mode_image_does():
+    shape = 9, 9, 9
+    values = properties(np.full(shape, 40, np.float32), np.ones(shape, np.uint8), {1: "vessel"})
+    assert float(np.median(values[3:6, 3:6, 3:6, BACKSCATTER])) == pytest.approx(BLOOD, rel=0.01)
 
 
 def test_the_shift_of_a_velocity_is_twice_its_share_of_the_speed_of_sound():
