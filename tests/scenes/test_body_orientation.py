@@ -9,7 +9,7 @@ import pytest
 import SimpleITK as sitk
 from synthetic_body import BODY, DIRECTIONS, LEFT, RIGHT, drawn, grid_around
 
-from scenes.patients.body_orientation import orientation_warnings
+from scenes.patients.body_orientation import _lungs_z, orientation_warnings
 from scenes.patients.organ_selection import midline_x
 from scenes.patients.patient_import import _overview
 from scenes.patients.readers.ct_series import open_ct
@@ -61,6 +61,16 @@ def test_the_overview_has_the_voxels_nearest_to_15_tenths_of_a_mm_in_place():
     assert overview.GetSpacing() == pytest.approx((1.8, 1.2, 2.0))
     place = overview.TransformIndexToPhysicalPoint((3, 7, 5))
     assert overview[3, 7, 5] == hounsfield[tuple(np.rint((place - origin) / spacing).astype(int)[::-1])]
+
+
+@pytest.mark.parametrize("spacing_z, is_lung", [(4.0, True), (3.99, False)])
+def test_gas_in_the_body_is_a_lung_from_150_ml_on(spacing_z, is_lung):
+    """A box of 12 x 16 x 13 cells without its edges, which an opening takes: 2348 cells, of 150.3 ml or 149.9 ml."""
+    mean = np.full((30, 30, 30), -1000.0)
+    mean[:, 3:27, 3:27] = 0.0
+    mean[8:21, 7:23, 9:21] = -800.0
+    grid = VoxelGrid((30, 30, 30), np.array([4.0, 4.0, spacing_z]), np.zeros(3), np.eye(3))
+    assert _lungs_z(grid, mean) == (pytest.approx(14 * spacing_z) if is_lung else None)
 
 
 def check(found, flip):

@@ -15,6 +15,7 @@ from scenes.patients.organ_selection import find_organs
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import LabelMap
 from scenes.patients.readers.segment_codes import dicom_meaning, slicer_meaning
+from scenes.volumes.voxel_grid import VoxelGrid
 
 TISSUE, STRUCTURE = "SCT^85756007^Tissue", "SCT^123037004^Anatomical Structure"
 ALTERED = "SCT^49755003^Morphologically Altered Structure"
@@ -197,3 +198,17 @@ def test_coded_segments_beside_the_organ_are_known(tmp_path):
         assert (
             _place(piece, np.array([[70.0, 35.0, z]])) == f"in the {third} third, at 70, 35, {z:.0f} mm (LPS)"
         )
+
+
+@pytest.mark.parametrize(("voxels", "is_named"), [(500, True), (499, False)])
+def test_what_touches_the_organ_and_has_no_known_tissue_is_named_from_half_a_ml_on(voxels, is_named):
+    """A plate of voxels of 1 mm on one side of a block."""
+    values = np.zeros((60, 60, 60), np.uint8)
+    values[5:55, 10:45, 5:45] = 2
+    # Voxels (20 to 44, 45, 10 to 29).
+    at = np.argwhere(np.ones((25, 1, 20)))[:voxels] + [20, 45, 10]
+    values[tuple(at.T)] = 3
+    grid = VoxelGrid((60, 60, 60), np.ones(3), np.zeros(3), np.eye(3))
+    labels = LabelMap.valued(grid, values, {2: "kidney_left", 3: "Segment_9"})
+    found = label_warnings(labels, find_organs(labels, [2])[0], True, [labels])
+    assert len(found) == is_named and all("(0.5 ml) touches the organ" in line for line in found)
