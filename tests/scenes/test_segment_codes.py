@@ -202,11 +202,10 @@ def test_coded_segments_beside_the_organ_are_known(tmp_path):
 
 @pytest.mark.parametrize(("voxels", "is_named"), [(500, True), (499, False)])
 def test_what_touches_the_organ_and_has_no_known_tissue_is_named_from_half_a_ml_on(voxels, is_named):
-    """A plate of voxels of 1 mm on one side of a block."""
+    """A rod of voxels of 1 mm that stands out of a block."""
     values = np.zeros((60, 60, 60), np.uint8)
-    values[5:55, 10:45, 5:45] = 2
-    # Voxels (20 to 44, 45, 10 to 29).
-    at = np.argwhere(np.ones((25, 1, 20)))[:voxels] + [20, 45, 10]
+    values[5:55, 5:35, 5:45] = 2
+    at = np.argwhere(np.ones((5, 20, 5)))[:voxels] + [25, 35, 20]
     values[tuple(at.T)] = 3
     grid = VoxelGrid((60, 60, 60), np.ones(3), np.zeros(3), np.eye(3))
     labels = LabelMap.valued(grid, values, {2: "kidney_left", 3: "Segment_9"})
