@@ -204,6 +204,19 @@ def test_attenuated_speckle_keeps_its_mean_square_and_becomes_longer(fine, detai
         assert correlation == pytest.approx(np.exp(-0.5 * (2 * probe.sample_mm / length) ** 2), abs=0.08)
 
 
+def test_speckle_longer_than_the_longest_kernel_keeps_its_mean_square(fine):
+    """Samples of 0.03 mm, and a loss that makes the pulse longer by more than 4 of them: no kernel is longer."""
+    probe, attenuation = probe_of(frequency_mhz=3.0, depth_mm=20.0), 3.0
+    fine.fill(backscatter=0.1)
+    whole = fine.look(probe, "speckle")
+    fine.fill(attenuation=attenuation, backscatter=0.1)
+    lost = fine.look(probe, "speckle") + loss_db(0.2 * attenuation * depths(probe), 3.0)
+    longer_mm = np.sqrt((fwhm_mm(0.2 * attenuation * 18.0, 3.0) / FWHM) ** 2 - probe.speckle_sd_mm**2)
+    assert longer_mm > 4.1 * probe.sample_mm
+    energy = [(10 ** (each[:, 580:] / 10)).mean() for each in (whole, lost)]
+    assert 10 * np.log10(energy[1] / energy[0]) == pytest.approx(0.0, abs=1.0)
+
+
 def mirrored(tilt_deg: float, half_angle_deg: float) -> float:
     """The share of an aperture's rays that a tilted mirror returns to the same aperture, counted."""
     rays = np.linspace(-half_angle_deg, half_angle_deg, 20_001)
