@@ -35,8 +35,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest first: no worker is left with it when the others have ended, nor takes half of a file whose fixture takes long."""
-    items.sort(key=lambda item: item.path.stem not in ("test_window", "test_app"))
+    """The longest first: no worker is left with it when the others have ended, nor takes half of a file whose fixture takes long.
+
+    Scenes last: they have no kernels, so that one of two workers compiles nearly all.
+    """
+    longest = "test_window", "test_app"
+    items.sort(key=lambda item: (item.path.stem not in longest, item.path.parent.name == "scenes"))
 
 
 def pytest_collection_finish() -> None:

@@ -77,15 +77,15 @@ def signed_distance_of(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
 
 
 def coarse_distance(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return the depth [mm] (nx, ny, nz) of voxels below a mask's surface, negative outside, computed in cells of about CELL_MM, and interpolated.
+    """Return distances [mm] (nx, ny, nz) of the voxels of a mask from those outside it, computed in cells of about CELL_MM, and interpolated.
 
     A cell belongs to the mask if half of its voxels do.
     """
     step = cell_voxels(spacing_mm)
     whole = np.pad(mask, [(0, -n % k) for n, k in zip(mask.shape, step, strict=True)], mode="edge")
     cells = block_reduce(whole, tuple(step), np.mean) >= 0.5
-    depth = refined(-signed_distance_of(cells, spacing_mm * step), step)
-    return depth[tuple(slice(n) for n in mask.shape)]
+    distance = refined(ndimage.distance_transform_edt(cells, sampling=spacing_mm * step), step)
+    return distance[tuple(slice(n) for n in mask.shape)]
 
 
 def cell_voxels(spacing_mm: np.ndarray, cell_mm: float = CELL_MM) -> np.ndarray:
