@@ -7,7 +7,7 @@ from typing import Any
 from errors import UserError
 from scenes.scene import OPTIONS, Scene, SolverSection, with_options
 from scenes.tissue import QUALITIES, TISSUES
-from ultrasound.probe import Probe, load_probe
+from ultrasound.probe import Probe, ProbeError, changed_probe, load_probe
 
 # The paper's Table 1, where a tissue model has no choice of its own.
 PAPER_STEP: dict[str, Any] = dict(substeps=3, iterations=9, relaxation_factor=1.0)
@@ -118,4 +118,15 @@ def probe_of(scene: Scene) -> Probe:
     """The probe that a scene names, with the scene's depth and housing if it has them. Raises ProbeError."""
     own = {"depth_mm": scene.image.depth_mm, "housing_mm": scene.transducer.size_mm}
     given = {key: value for key, value in own.items() if value is not None}
-    return load_probe(scene.transducer.probe).model_copy(update=given)
+    probe = load_probe(scene.transducer.probe)
+    try:
+        return changed_probe(probe, **given)
+    except ProbeError as error:
+        keys = {"depth_mm": "image.depth_mm", "housing_mm": "transducer.size_mm"}
+        values = " and ".join(
+            f"{keys[key]} = {list(value) if isinstance(value, tuple) else value}"
+            for key, value in given.items()
+        )
+        raise ProbeError(
+            f"{values} does not fit the probe {probe.transducer_name}: {error}; change it, or leave it out"
+        ) from None

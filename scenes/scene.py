@@ -22,6 +22,8 @@ from version import FORMAT, of_this_format
 EMBEDDED = Path(__file__).parent / "phantom.toml"
 # The same patient, with the transducer and the indentation depths of the paper; the studies use it.
 PAPER = Path(__file__).parent / "paper.toml"
+# Rigid shapes, and the probe's, have a bit each of a word of 31.
+MOST_SHAPES = 30
 # Command line options for single values of a scene.
 OPTIONS = {
     "tissue.model": "--model",
@@ -256,7 +258,7 @@ class Scene(Section):
     gravity: Gravity = Gravity()
     contact: Contact = Contact()
     attachment: Attachment = Attachment()
-    shape: Annotated[tuple[Shape, ...], LIST] = ()
+    shape: Annotated[tuple[Shape, ...], LIST, Field(max_length=MOST_SHAPES)] = ()
     transducer: Transducer = Transducer()
     trocar: Trocar = Trocar()
     image: Image = Image()

@@ -8,7 +8,7 @@ from sim.body import ParticleBody
 from sim.fields import array_of, fill, fill_evenly, zeros
 from sim.friction import sticking_fraction, tangential
 from sim.kernels import kernel
-from sim.shapes import FAR, TimeOfImpact
+from sim.shapes import FAR, TimeOfImpact, check_count
 
 PROJECTION_ITERATIONS = 8
 # Distance around a static shape within which the distance to it must be known, in particle radii.
@@ -32,6 +32,7 @@ class ShapeContacts:
     """
 
     def __init__(self, body: ParticleBody, shapes: list, friction: float) -> None:
+        check_count(shapes)
         self.body = body
         self.shapes = list(shapes)
         self.time_of_impact = TimeOfImpact(shapes)

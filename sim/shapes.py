@@ -22,6 +22,8 @@ OUTSIDE_GRID_CELLS = 0.5
 # Spacing of a distance grid: on average within 0.005 mm of a support's surface, except at sharp edges.
 GRID_MM = 1.0
 MOST_SUBSTEPS = 100
+# Contacts have a bit of a signed word for each shape.
+MOST_SHAPES = 31
 # A path ends this deep in a shape [mm], so that a body can slide along it; thinner shapes stop nothing fast.
 IMPACT_DEPTH_MM = 1.0
 # Each step of sphere tracing is as long as the clearance; only paths along a surface need many.
@@ -232,6 +234,12 @@ class ConvexTool:
         if distance > 1e-4:
             depth, normal = distance, outward / distance
         return tm.vec4(rotation @ normal, depth - self.edge_radius)
+
+
+def check_count(shapes: list) -> None:
+    """Raises ValueError for more shapes than contacts have bits for."""
+    if len(shapes) > MOST_SHAPES:
+        raise ValueError(f"{len(shapes)} shapes: expected at most {MOST_SHAPES}, tools included")
 
 
 class TimeOfImpact:

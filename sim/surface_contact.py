@@ -15,7 +15,7 @@ from sim.fields import array_of, fields_of, fill, fill_evenly, zeros
 from sim.friction import sticking_fraction, tangential
 from sim.kernels import kernel
 from sim.lattice import Lattice
-from sim.shapes import FAR, TimeOfImpact
+from sim.shapes import FAR, TimeOfImpact, check_count
 
 # Depth in a shape at which the contact pressure is Young's modulus.
 PENALTY_DEPTH_MM = 0.05
@@ -32,7 +32,7 @@ REACH_MM = 6.0
 
 
 class SurfaceContacts:
-    """Contact points on the surface, each interpolated from 8 nodes, and their contacts; at most 31 shapes.
+    """Contact points on the surface, each interpolated from 8 nodes, and their contacts; at most MOST_SHAPES shapes.
 
     point (p,): current positions [mm]. plane (shapes, p): normal and offset of n . x >= offset [mm]. slip (shapes, p): elastic
     tangential slip [mm]. near (p,): bits of the shapes that are near. found (shapes, p): point and distance [mm] of the last
@@ -48,6 +48,7 @@ class SurfaceContacts:
         shapes: list,
         friction: float,
     ) -> None:
+        check_count(shapes)
         self.body = body
         self.shapes = list(shapes)
         self.time_of_impact = TimeOfImpact(shapes)

@@ -316,6 +316,15 @@ def probe_of_values(values: Mapping[str, Any]) -> Probe:
     """Return the probe of a file's values. Raises ProbeError, which names the key."""
     for key in FORMER_KEYS.keys() & values.keys():
         raise ProbeError(f"{key} no longer exists; delete it ({FORMER_KEYS[key]} sets the same)")
+    return _validated(values)
+
+
+def changed_probe(probe: Probe, **changes: Any) -> Probe:
+    """Return a probe with some fields changed. Raises ProbeError where they do not fit together."""
+    return _validated(probe.model_dump() | changes)
+
+
+def _validated(values: Mapping[str, Any]) -> Probe:
     try:
         return Probe.model_validate(values)
     except ValidationError as error:

@@ -40,6 +40,9 @@ def refused(tmp_path: Path, text: str) -> str:
     return str(error.value)
 
 
+PLANE = "[[shape]]\nkind = 'plane'\nnormal = [0, 0, 1]\noffset_mm = 1\n"
+
+
 @pytest.mark.parametrize(
     "text, words",
     [
@@ -109,6 +112,7 @@ def refused(tmp_path: Path, text: str) -> str:
             "prony.0.modulus_ratio = True: input",
         ),
         ("[anatomy]\n[[shape]]\nkind = 'ball'", "'plane', 'mesh', 'sdf'"),
+        ("[anatomy]\n" + PLANE * 31, "at most 30 items"),
         ("[anatomy]\n[organs]\n", "organs: unknown key"),
         (
             "[anatomy]\nphantm = 1\n[tissue]\nyoung_kpa = 0\npoison = 0",
@@ -301,6 +305,28 @@ def test_a_scenes_probes_file_lies_beside_it(tmp_path, monkeypatch):
     (tmp_path / "scenes" / "mine.toml").unlink()
     with pytest.raises(ProbeError, match="scenes.*mine.toml' is no file, and known by name are"):
         probe_of(scene)
+
+
+@pytest.mark.parametrize(
+    "size_mm, depth_mm, words",
+    [
+        (
+            (16.0, 2.0, 20.0),
+            None,
+            r"^transducer.size_mm = \[16.0, 2.0, 20.0\] does not fit the probe Drop-in.*EdgeRadiusMm = 1.5",
+        ),
+        ((12.0, 9.0, 6.0), 50.0, r"image.depth_mm = 50.0.*the array is 15.9 mm wide, HousingMm 12"),
+    ],
+)
+def test_a_size_that_does_not_fit_the_probe_is_refused(size_mm, depth_mm, words):
+    scene = load_scene(EMBEDDED)
+    changed = scene.model_copy(
+        update=dict(transducer=Transducer(probe="drop-in", size_mm=size_mm), image=Image(depth_mm=depth_mm))
+    )
+    with pytest.raises(ProbeError, match=words):
+        probe_of(changed)
+    fits = scene.model_copy(update=dict(transducer=Transducer(probe="drop-in", size_mm=(18.0, 10.0, 22.0))))
+    assert probe_of(fits).housing_mm == (18.0, 10.0, 22.0)
 
 
 def test_fluid_couples_as_far_as_it_reaches():

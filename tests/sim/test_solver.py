@@ -30,6 +30,13 @@ def solver_of(
     return Solver(model, particle_contacts, tool)
 
 
+def test_more_shapes_than_contacts_have_bits_for_are_refused(one_device, ball):
+    floor = Plane(np.array([0.0, 0.0, 1.0]), -12.0)
+    assert solver_of(ball, [floor] * 31).contacts is not None
+    with pytest.raises(ValueError, match="32 shapes: expected at most 31"):
+        solver_of(ball, [floor] * 32)
+
+
 def on_floor(mesh, height_mm: float, friction: float = 0.35) -> Solver:
     """A body over a plane."""
     return solver_of(mesh, [Plane(np.array([0.0, 0.0, 1.0]), height_mm)], friction)
