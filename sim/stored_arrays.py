@@ -22,6 +22,8 @@ import trimesh
 Arrays: TypeAlias = tuple[np.ndarray, ...]
 # Where the files are, readable to their owner alone; None keeps nothing.
 FOLDER: Path | None = Path(__file__).parents[1] / ".cache" / "arrays"
+# What is computed may call anything in these.
+SOURCES = tuple(Path(__file__).parents[1] / name for name in ("sim", "scenes", "ultrasound", "rehearsal"))
 # The files used least recently are removed beyond this size. The embedded patient has 60 MB.
 MOST_BYTES = 256 << 20
 LIBRARIES = " ".join([sys.version, *map(version, ("numpy", "scipy", "libigl", "trimesh", "taichi"))])
@@ -55,8 +57,7 @@ def _in_order(arrays: Arrays) -> Arrays:
 
 def _key(compute: Callable[..., Arrays], arguments: tuple[object, ...], backend: str) -> str:
     digest = hashlib.sha256(f"{compute.__module__} {compute.__qualname__} {backend} {LIBRARIES}".encode())
-    digest.update(_sources(Path(str(sys.modules[compute.__module__].__file__)).parent))
-    digest.update(_sources(Path(__file__).parent))
+    digest.update(_sources(SOURCES))
     for argument in arguments:
         parts = (argument.vertices, argument.faces) if isinstance(argument, trimesh.Trimesh) else (argument,)
         for part in parts:
@@ -75,9 +76,9 @@ def _add(digest: "hashlib._Hash", value: object) -> None:
 
 
 @functools.cache
-def _sources(folder: Path) -> bytes:
-    """A hash of a folder's sources, so that arrays of another version are not read."""
-    files = sorted(folder.glob("*.py"))
+def _sources(folders: tuple[Path, ...]) -> bytes:
+    """A hash of all sources and tables of folders, so that arrays of another version are not read."""
+    files = sorted(file for folder in folders for kind in ("*.py", "*.toml") for file in folder.rglob(kind))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).digest()
 
 

@@ -42,6 +42,23 @@ def test_another_input_is_computed(other):
     assert len(CALLS) == 2
 
 
+@pytest.mark.parametrize("name", ["scenes/surfaces.py", "ultrasound/probes/linear.toml"])
+def test_another_source_or_table_anywhere_is_computed_again(monkeypatch, tmp_path, name):
+    file = tmp_path / name
+    file.parent.mkdir(parents=True)
+    monkeypatch.setattr(stored_arrays, "SOURCES", (tmp_path / "scenes", tmp_path / "ultrasound"))
+    for count, text in ((1, "a = 1"), (1, "a = 1"), (2, "a = 2")):
+        file.write_text(text)
+        stored_arrays._sources.cache_clear()
+        stored(computed, 3.5)
+        assert len(CALLS) == count
+
+
+def test_every_source_that_a_computation_may_call_counts():
+    files = {file.name for folder in stored_arrays.SOURCES for file in folder.rglob("*")}
+    assert {"surfaces.py", "acoustics.py", "tissue_map.py", "pressed_organ.py", "blood_flow.toml"} <= files
+
+
 def test_surfaces_and_arrays_count_by_their_values():
     ball = trimesh.creation.icosphere(subdivisions=2, radius=12.0)
     stored(computed, ball)
