@@ -31,6 +31,9 @@ KEEP_S, KEEP_STEPS = 1.0, 60
 # A point this far from the body's rest centre has left the scene; beyond the second distance it counts as not finite.
 FARTHEST_MM, INFINITE_MM = 500.0, 1e12
 
+# All bits of a float32 but its sign, and those of INFINITE_MM: they are ordered as the numbers are, and what is no number is above.
+MAGNITUDE, INFINITE_BITS = 0x7FFFFFFF, int(np.float32(INFINITE_MM).view(np.int32))
+
 
 @dataclass(frozen=True)
 class Health:
@@ -159,9 +162,9 @@ class DivergenceCheck:
         self.farthest[None] = 0.0
         ti.loop_config(serialize=self.serial)
         for i in range(self.body.count):
-            distance = (self.body.position[i] - self.middle).norm()
-            if distance < INFINITE_MM:
-                ti.atomic_max(self.farthest[None], distance)
+            x = self.body.position[i]
+            if is_finite(x):
+                ti.atomic_max(self.farthest[None], (x - self.middle).norm())
             else:
                 self.faults[None][0] += 1
         if ti.static(self.has_tetrahedra):
@@ -186,6 +189,15 @@ class DivergenceCheck:
             if tangled:
                 tangled = self.tool.is_beyond(origin, CRUSHED_MM)
         return tangled
+
+
+@ti.func
+def is_finite(x):
+    """Whether a position has numbers below INFINITE_MM alone: by their bits, as comparisons with what is no number may be left out."""
+    finite = True
+    for k in ti.static(range(3)):
+        finite &= (ti.bit_cast(x[k], ti.i32) & MAGNITUDE) < INFINITE_BITS
+    return finite
 
 
 def tetrahedra_among(points: np.ndarray) -> np.ndarray:

@@ -176,6 +176,20 @@ def test_tissue_near_the_tool_is_not_counted_as_tangled(kept, ball):
     assert divergence_check.health().tangled == pytest.approx(beyond.mean(), abs=1e-6)
 
 
+@pytest.mark.parametrize("value", [np.nan, -np.nan, np.inf, -np.inf, 2e12])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_one_number_of_one_point_is_found(kept, ball, value, axis):
+    solver = on_floor(kept, "neo-hookean", ball)
+    divergence_check, good = DivergenceCheck(solver), solver.snapshot().body.position
+    wrong = good.copy()
+    wrong[len(good) // 2, axis] = value
+    put(solver, wrong)
+    assert not divergence_check.health().finite
+    wrong[len(good) // 2, axis] = 0.5e12
+    put(solver, wrong)
+    assert divergence_check.health().finite and divergence_check.health().is_lost
+
+
 @pytest.mark.parametrize("model", MODELS)
 def test_torn_points_stay_finite(kept, ball, model):
     solver = on_floor(kept, model, ball)
