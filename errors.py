@@ -46,7 +46,6 @@ CAUSES: tuple[tuple[type[Exception], str], ...] = (
     (zlib.error, "its compression is damaged"),
     (gzip.BadGzipFile, "its compression is damaged"),
     (zipfile.BadZipFile, "its end or list of files is damaged"),
-    (MemoryError, "the memory is full"),
     (RecursionError, "it is nested too deeply"),
     (NotImplementedError, "a form that is not supported"),
     (UnicodeError, "a text of unknown encoding"),
@@ -80,6 +79,11 @@ def parsing(what: str, advice: str) -> Iterator[None]:
             yield
     except PatientError:
         raise
+    except MemoryError as error:
+        raise PatientError(
+            f"{what.rpartition(': ')[0] or what}: the memory is full while it is read; close other programs and try again; where there is "
+            "enough memory, the file is damaged"
+        ) from error
     except Exception as error:
         cause = _cause(error)
         raise PatientError(f"{what}{f' ({cause})' if cause else ''}; {advice}") from error

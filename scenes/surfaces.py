@@ -55,6 +55,8 @@ def read_triangles(path: Path) -> trimesh.Trimesh:
         # From an open file: the path would let an OBJ name files that are then read, such as textures.
         with path.open("rb") as file:
             surface = trimesh.load_mesh(file, file_type=path.suffix[1:].lower(), skip_materials=True)
+    except MemoryError:
+        raise
     except Exception:  # a damaged file is taken for other kinds, whose readers raise many kinds of error
         raise PatientError(
             f"{path}: is incomplete or damaged, or of another kind than its name ends in; expected {EXPECTED}; copy or export it again"

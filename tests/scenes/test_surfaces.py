@@ -194,3 +194,13 @@ def test_distances_on_a_grid_are_exact_near_the_surface_and_nearly_so_elsewhere(
     assert away[inner].max(initial=0.0) < 1e-9 and away[truth < 0].max() < (
         1e-9 if exact_mm[0] == -np.inf else 4.0
     )
+
+
+def test_a_full_memory_is_no_damaged_surface(tmp_path, monkeypatch):
+    def out_of_memory(*given, **named):
+        raise MemoryError
+
+    trimesh.creation.box().export(tmp_path / "organ.stl")
+    monkeypatch.setattr(trimesh, "load_mesh", out_of_memory)
+    with pytest.raises(MemoryError):
+        load_surface(tmp_path / "organ.stl")

@@ -111,6 +111,8 @@ def _frames_of_bytes(item: SourceFile, data: Dataset) -> np.ndarray:
 def _decodes(data: Dataset) -> bool:
     try:
         pixel_array(data, index=0)
+    except MemoryError:
+        raise
     except Exception:  # decoders raise many kinds of error
         return False
     return True
