@@ -145,7 +145,9 @@ def test_what_a_parser_raises_is_said_in_words(error, words):
 
 
 def test_a_full_memory_is_no_damaged_file():
-    with pytest.raises(PatientError, match=r"^scan/ct.dcm: the memory is full") as caught:
-        with parsing("scan/ct.dcm: a damaged DICOM file", "copy it again"):
-            raise MemoryError
+    with (
+        pytest.raises(PatientError, match=r"^scan/ct.dcm: the memory is full") as caught,
+        parsing("scan/ct.dcm: a damaged DICOM file", "copy it again"),
+    ):
+        raise MemoryError
     assert "copy it again" not in str(caught.value)

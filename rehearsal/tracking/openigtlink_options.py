@@ -46,5 +46,8 @@ def open_link(asked: LinkOptions) -> "OpenIGTLinkServer | None":
     click.get_current_context().with_resource(server)
     click.echo(f"The link is open: OpenIGTLink on {host}, port {port}.")
     if not server.is_private:
-        click.echo("Warning: everyone who can reach this machine over the network can read the image.")
+        steer = " and move the probe" if asked.link_leads else ""
+        click.echo(
+            f"Warning: everyone who can reach this machine over the network can read the image{steer}."
+        )
     return server

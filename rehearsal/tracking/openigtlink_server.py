@@ -43,6 +43,8 @@ TRANSFORM_BYTES, CHUNK_BYTES = 1 << 16, 1 << 16
 HAND_TO_REFERENCE = "HandToReference"
 STALE_S = 1.0
 FARTHEST_MM = 10_000.0
+# More clients are not served. One that takes no data for so long, or does not end its message, is disconnected.
+MOST_CLIENTS, IDLE_S = 8, 30.0
 
 
 class MessageError(ValueError):
@@ -93,7 +95,7 @@ class OpenIGTLinkServer:
     def __init__(self, host: str, port: int, message: Callable[[str], None]) -> None:
         self.received_pose = ReceivedPose(message)
         self._message, self._has_refused = message, False
-        self.damaged_messages = 0
+        self.damaged_messages = self._clients = 0
         self._newest: tuple[MessageBase, ...] = ()
         self._loop = asyncio.new_event_loop()
         # Set when there is a newer image, and replaced by one for the next.
@@ -105,12 +107,13 @@ class OpenIGTLinkServer:
             raise
         self._thread = Thread(target=self._loop.run_forever, daemon=True)
         self._thread.start()
-        self.host, self.port = self._server.sockets[0].getsockname()[:2]
+        self.addresses = [socket.getsockname()[0] for socket in self._server.sockets]
+        self.port = self._server.sockets[0].getsockname()[1]
 
     @property
     def is_private(self) -> bool:
         """Whether only programs on this machine can connect."""
-        return ip_address(self.host).is_loopback
+        return all(ip_address(address).is_loopback for address in self.addresses)
 
     def send(
         self,
@@ -165,16 +168,27 @@ class OpenIGTLinkServer:
         self._has_newer = asyncio.Event()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """One client, until it leaves or sends what is no message."""
+        """One client, until it leaves, sends what is no message, or is idle."""
+        if self._clients == MOST_CLIENTS:
+            self._warn_once(f"one more than {MOST_CLIENTS} clients of the link was disconnected")
+            writer.transport.abort()
+            return
+        self._clients += 1
         both = [asyncio.create_task(each) for each in (self._send_to(writer), self._read_from(reader))]
         try:
             # asyncio prints a traceback for a client that ends cancelled.
             with suppress(asyncio.CancelledError):
                 await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
         finally:
+            self._clients -= 1
             for each in both:
                 each.cancel()
             writer.transport.abort()
+
+    def _warn_once(self, text: str) -> None:
+        if not self._has_refused:
+            self._has_refused = True
+            self._message(f"Warning: {text}")
 
     async def _send_to(self, writer: asyncio.StreamWriter) -> None:
         sent: tuple[MessageBase, ...] = ()
@@ -185,23 +199,24 @@ class OpenIGTLinkServer:
                     await has_newer.wait()
                 sent = self._newest
                 writer.write(b"".join(message.pack() for message in sent))
-                await writer.drain()
+                async with asyncio.timeout(IDLE_S):
+                    await writer.drain()
 
     async def _read_from(self, reader: asyncio.StreamReader) -> None:
         with suppress(OSError, EOFError):
             try:
                 while True:
-                    await self._read_message(reader)
+                    first = await reader.readexactly(1)
+                    async with asyncio.timeout(IDLE_S):
+                        await self._read_message(first, reader)
             except MessageError as error:
-                if not self._has_refused:
-                    self._has_refused = True
-                    self._message(
-                        f"Warning: a client of the link was disconnected: it sent no OpenIGTLink message: {error}"
-                    )
+                self._warn_once(
+                    f"a client of the link was disconnected: it sent no OpenIGTLink message: {error}"
+                )
 
-    async def _read_message(self, reader: asyncio.StreamReader) -> None:
-        """Take the next message; all but transforms are skipped. Raises MessageError, EOFError, OSError."""
-        header = await reader.readexactly(MessageBase.IGTL_HEADER_SIZE)
+    async def _read_message(self, first: bytes, reader: asyncio.StreamReader) -> None:
+        """Take the message that begins with a byte; all but transforms are skipped. Raises MessageError, EOFError, OSError."""
+        header = first + await reader.readexactly(MessageBase.IGTL_HEADER_SIZE - 1)
         try:
             fields = MessageBase.parse_header(_without_rests(header))
         except UnicodeDecodeError as error:

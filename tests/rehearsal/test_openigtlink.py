@@ -22,6 +22,7 @@ from rehearsal.tracking.openigtlink_server import (
     HAND_TO_REFERENCE,
     IMAGE,
     IMAGE_TO_PROBE,
+    MOST_CLIENTS,
     PROBE,
     STALE_S,
     OpenIGTLinkServer,
@@ -266,6 +267,41 @@ def test_clients_that_disconnect_or_send_garbage_do_not_disturb_others(server, s
     server.send(*live(6))
     assert len(said) == 1 and "was disconnected" in said[0]
     assert soon(lambda: not asyncio.all_tasks(server._loop)) and server.received_pose.pose() is None
+
+
+def test_more_clients_than_are_served_are_disconnected_and_say_so_once(server, said):
+    served = [joined(server) for _ in range(MOST_CLIENTS)]
+    server.send(*live(5))
+    assert [next_picture(each)[72] for each in served] == [5] * MOST_CLIENTS
+    for _ in range(2):
+        with joined(server) as one_more, suppress(ConnectionResetError):
+            assert one_more.recv(1) == b""
+    assert soon(lambda: said) and len(said) == 1 and f"more than {MOST_CLIENTS} clients" in said[0]
+    for each in served:
+        each.close()
+    assert soon(lambda: not asyncio.all_tasks(server._loop))
+    with joined(server) as connection:
+        assert next_picture(connection)[72] == 5
+
+
+@pytest.mark.parametrize("sends", [True, False], ids=["half a message", "takes no data"])
+def test_an_idle_client_is_disconnected(server, monkeypatch, sends):
+    monkeypatch.setattr("rehearsal.tracking.openigtlink_server.IDLE_S", 0.2)
+    # One that sends nothing may stay: a viewer does so.
+    with joined(server) as viewer, joined(server) as idle:
+        if sends:
+            idle.sendall(b"\0" * 30)
+            with suppress(ConnectionResetError):
+                assert idle.recv(1) == b""
+        else:
+            for number in range(200):
+                server.send(*live(number, 512, 512))
+                while next_picture(viewer)[72] != number:
+                    pass
+            assert soon(lambda: server._clients == 1)
+        server.send(*live(201))
+        while next_picture(viewer)[72] != 201:
+            pass
 
 
 def test_other_messages_are_ignored(server, client):

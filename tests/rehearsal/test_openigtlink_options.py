@@ -16,7 +16,7 @@ def linking(asked: LinkOptions) -> None:
     server = open_link(asked)
     if server is not None:
         joined(server).close()
-        click.echo(f"on {server.host}")
+        click.echo(f"on {' '.join(server.addresses)}")
 
 
 def free_port() -> int:
@@ -33,7 +33,17 @@ def test_the_link_is_off_unless_asked_for_private_unless_told_and_ends_with_its_
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", port), SOON_S)
     done = CliRunner().invoke(linking, ["--link", "--link-host", "0.0.0.0", "--link-port", str(port)])
-    assert done.exit_code == 0 and done.output.count("over the network can read") == 1
+    assert done.exit_code == 0 and done.output.count("over the network can read the image.") == 1
+    # A client that leads moves the probe.
+    leads = ["--link", "--link-leads", "--link-host", "0.0.0.0", "--link-port", str(port)]
+    assert "can read the image and move the probe." in CliRunner().invoke(linking, leads).output
+
+
+@pytest.mark.parametrize("hosts, is_private", [(["127.0.0.1"], True), (["127.0.0.1", "0.0.0.0"], False)])
+def test_a_link_is_private_if_all_its_addresses_are(server, monkeypatch, hosts, is_private):
+    """A name may have several, of which the first is this machine alone."""
+    monkeypatch.setattr(server, "addresses", hosts)
+    assert server.is_private == is_private
 
 
 def test_a_link_that_cannot_be_is_refused_in_words(server):
