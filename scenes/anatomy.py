@@ -53,12 +53,13 @@ class LoadedAnatomy:
 def load_anatomy(scene: Scene, folder: Path, progress: ReportProgress = no_progress) -> LoadedAnatomy:
     """Read the files of a scene, relative to ``folder``. Raises SceneError, PatientError."""
     folder, anatomy = files_of(scene, folder, progress)
+    ct = _grid(folder, anatomy.ct) if anatomy.ct else None
     return LoadedAnatomy(
         organ=load_surface(folder / anatomy.organ),
         tumour=load_surface(folder / anatomy.tumour) if anatomy.tumour else None,
-        ct=_grid(folder, anatomy.ct) if anatomy.ct else None,
+        ct=ct,
         shapes=tuple(_shape(folder, shape) for shape in scene.shape),
-        labels=_labels(folder, anatomy),
+        labels=_labels(folder, anatomy, ct),
         tissues={int(label): tissue for label, tissue in anatomy.tissues.items()},
         parts={tissue: load_surface(folder / file) for tissue, file in anatomy.parts.items()},
         corrections=_grid(folder, anatomy.corrections) if anatomy.corrections else None,
@@ -123,11 +124,11 @@ def _grid(folder: Path, name: str) -> Grid:
     return Grid(np.ascontiguousarray(volume.read().transpose(2, 1, 0), np.float32), volume.grid.index_from_mm)
 
 
-def _labels(folder: Path, anatomy: AnatomyFiles) -> Grid | None:
+def _labels(folder: Path, anatomy: AnatomyFiles, ct: Grid | None) -> Grid | None:
     """The label map. Raises SceneError where it is on another grid than the CT."""
-    if anatomy.labels is None or anatomy.ct is None:
+    if anatomy.labels is None or ct is None:
         return None
-    labels, ct = _grid(folder, anatomy.labels), _grid(folder, anatomy.ct)
+    labels = _grid(folder, anatomy.labels)
     if labels.voxels.shape != ct.voxels.shape or not np.allclose(
         labels.index_from_mm, ct.index_from_mm, atol=1e-3
     ):

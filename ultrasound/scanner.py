@@ -271,6 +271,7 @@ class Scanner:
     def _compounded(self, probe: Probe, detail_level: DetailLevel) -> np.ndarray:
         """Return the mean of images that are steered by different angles, where these reach."""
         angles = probe.compound_angles_deg[1:]
+        self._steered = {angle: image for angle, image in self._steered.items() if angle in angles}
         first = self.bmode.render(probe, detail_level)
         if not angles:
             return first

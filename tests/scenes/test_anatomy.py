@@ -7,9 +7,11 @@ import pytest
 import trimesh
 from conftest import ROOT
 
+from scenes import anatomy
 from scenes.anatomy import Grid, fingerprint, load_anatomy
 from scenes.phantom.embedded_patient import phantom_folder
 from scenes.scene import EMBEDDED, load_scene
+from scenes.volumes.volume_files import file_volume
 
 LOAD = """
 import sys
@@ -28,6 +30,13 @@ def test_loading_a_scene_imports_no_importer_and_no_generator(embedded):
     command = [sys.executable, "-c", LOAD, EMBEDDED if embedded else folder]
     found = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.splitlines()
     assert found == ["True", "['scenes.phantom.embedded_patient']"]
+
+
+def test_each_volume_is_read_once(monkeypatch):
+    read = []
+    monkeypatch.setattr(anatomy, "file_volume", lambda path: (read.append(path.name), file_volume(path))[1])
+    load_anatomy(load_scene(EMBEDDED), EMBEDDED.parent)
+    assert sorted(read) == ["ct.nrrd", "labels.nrrd"]
 
 
 def test_the_embedded_patient_is_a_patients_folder():

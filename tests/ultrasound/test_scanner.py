@@ -1,5 +1,7 @@
 """The scanner: that each side of it is given what it asks for. What a side makes of it has tests of its own."""
 
+import gc
+import weakref
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -177,6 +179,18 @@ def test_compounding_averages_the_speckle_of_three_angles(scattering):
     speckle = [np.diff(each[middle], axis=0).std() for each in (three, one)]
     assert speckle[0] / speckle[1] == pytest.approx(3**-0.5, rel=0.2)
     assert three[middle].mean() == pytest.approx(one[middle].mean(), abs=6.0)
+
+
+def test_images_that_were_steered_for_compounding_are_freed_with_it(one_device):
+    scanner = scattering_of(UPRIGHT)
+    b_mode(scanner, PROBE.model_copy(update={"compound_angles": 5}))
+    steered = [weakref.ref(each) for each in scanner._steered.values()]
+    b_mode(scanner, PROBE.model_copy(update={"compound_angles": 3}))
+    gc.collect()
+    assert len(steered) == 4 and sum(each() is not None for each in steered) <= 2
+    b_mode(scanner, PROBE)
+    gc.collect()
+    assert not any(each() for each in steered) and not scanner._steered
 
 
 def test_images_of_different_steering_have_independent_speckle(scattering):
