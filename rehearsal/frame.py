@@ -26,7 +26,6 @@ from rehearsal.pressed_organ import Step
 from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.real_time.solver_process import SolverProcess
 from rehearsal.rehearsal import Rehearsal
-from rehearsal.resection.cut import Cut
 from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.resection_view import ResectionView, cut_settings
 from rehearsal.stopwatch import timed
@@ -157,7 +156,7 @@ class WindowFrames(Frames[WindowInput]):
     _notice: str = field(default="", init=False)
     _notice_until: float = field(default=0.0, init=False)
     _restored_until: float = field(default=0.0, init=False)
-    _shown_cut: Cut | None = field(default=None, init=False)
+    _shown_version: int = field(default=0, init=False)
     _kinds: set[tuple[str | bool, ...]] = field(default_factory=set, init=False)
 
     def __post_init__(self) -> None:
@@ -188,8 +187,8 @@ class WindowFrames(Frames[WindowInput]):
         with self.times.stage("state"):
             self.solver.collect()
             self.rehearsal.update_surfaces()
-        if self.rehearsal.cut is not self._shown_cut:
-            self._shown_cut = self.rehearsal.cut
+        if self.rehearsal.geometry_version != self._shown_version:
+            self._shown_version = self.rehearsal.geometry_version
             self.viewer.change_geometry(geometry_of(self.rehearsal))
             # Its frames show other surfaces.
             self.cine = Cine()

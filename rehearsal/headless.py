@@ -30,7 +30,7 @@ class Pictures:
 
     def __init__(self, rehearsal: Rehearsal, steps: int, out: Path) -> None:
         self.steps, self.out = steps, out
-        self._rehearsal, self._shown_cut = rehearsal, rehearsal.cut
+        self._rehearsal, self._shown_version = rehearsal, rehearsal.geometry_version
         self.viewer: Window | None = None
         try:
             self.viewer = open_viewer(rehearsal, visible=False)
@@ -51,8 +51,8 @@ class Pictures:
         picture = side_by_side(view)
         save_image_file(picture, self._slices / f"{step:05d}.png")
         if self.viewer is not None:
-            if self._rehearsal.cut is not self._shown_cut:
-                self._shown_cut = self._rehearsal.cut
+            if self._rehearsal.geometry_version != self._shown_version:
+                self._shown_version = self._rehearsal.geometry_version
                 self.viewer.change_geometry(geometry_of(self._rehearsal))
             self.viewer.draw(measurements.onto(view, settings))
             picture = Image.fromarray(self.viewer.picture())

@@ -66,7 +66,10 @@ class Rehearsal(PressedOrgan):
 
     ``progress`` is called with what is being built; ``needs_b_mode`` prepares the B-mode image meanwhile. Without
     ``settles`` the organ is as it was segmented until ``take_settled``, for where another process brings it to rest.
+    ``geometry_version`` counts how often the surfaces were built anew: by a cut, or its end.
     """
+
+    geometry_version = 0
 
     def __init__(
         self,
@@ -241,6 +244,7 @@ class Rehearsal(PressedOrgan):
         remains = self._remains(cut)
         super().apply_cut(cut)
         self._build_surfaces(remains)
+        self.geometry_version += 1
         self.embedding.skin.attach_again()
         if self.scanner is not None:
             self.scanner.set_crater(None if cut is None else Crater(cut.specimen, cut.settings.filling))

@@ -40,7 +40,7 @@ class Fake:
     def __init__(self) -> None:
         self.probe, self.origin = load_probe("linear"), np.array([100.0, 200.0, 300.0])
         self.settings, self.notice, self.status, self.steps = SimpleNamespace(time_step_s=STEP_S), "", "", 0
-        self.pose, self.latest = np.eye(4), None
+        self.pose, self.latest, self.geometry_version = np.eye(4), None, 0
         self.resection, self.cut, self.judgement, self.whole_tumour = NO_RESECTION, None, None, None
 
     @property
@@ -196,6 +196,16 @@ def test_the_first_image_of_a_new_kind_is_announced_over_the_last_one(looping):
         (first - n, announced)
         for n, announced in [(0, False), (1, False), (1, True), (2, False), (3, False), (4, False)]
     ]
+
+
+def test_surfaces_that_were_built_anew_are_drawn_anew_also_of_the_same_cut(monkeypatch, looping):
+    changed, settings = [], Settings()
+    monkeypatch.setattr(frame, "geometry_of", lambda rehearsal: rehearsal.geometry_version)
+    looping.viewer.change_geometry = changed.append
+    for version in (0, 0, 2, 2, 3):
+        looping.rehearsal.geometry_version = version
+        next_view(looping, Controls(settings))
+    assert changed == [2, 3]
 
 
 def test_each_frame_goes_to_the_link_as_it_is_shown(looping, sent):

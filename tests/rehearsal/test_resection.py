@@ -151,7 +151,12 @@ def test_a_cut_keeps_the_margin_and_undo_brings_all_back_bit_for_bit(rehearsal, 
     assert all(np.array_equal(image[name], again[name]) for name in image)
     moved(live, redo=True)
     moved(live, redo=True)
-    assert rehearsal.cut is not None
+    # The same cut again, with other surfaces: who draws the old ones is told by their version.
+    cut, version, drawn = rehearsal.cut, rehearsal.geometry_version, rehearsal.organ_skin
+    moved(live, undo=True)
+    moved(live, redo=True)
+    assert rehearsal.cut is cut is not None and rehearsal.organ_skin is not drawn
+    assert rehearsal.geometry_version == version + 2
 
 
 def test_the_images_show_the_crater(rehearsal, marks):
