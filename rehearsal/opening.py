@@ -75,12 +75,13 @@ def opened(asked: RehearseOptions, process: StartedProcess | None) -> Iterator["
                 scene, chosen = scene_within_budget(files, anatomy, arch, progress, asked)
                 if not asked.headless:
                     viewer = resources.enter_context(window(asked, files.keys))
+            # A session of this backend is replayed as it was recorded, on however many cores.
+            serial = files.log.header.serial if files.log and files.log.header.arch == arch else None
+            given = asked, scene, anatomy, files.probe, serial
             if solver is None or viewer is None:
-                rehearsal = built_headless(asked, scene, anatomy, files.probe, progress)
+                rehearsal = built_headless(*given, progress)
             else:
-                rehearsal = built_for_window(
-                    asked, scene, anatomy, files.probe, arch, solver, viewer, progress
-                )
+                rehearsal = built_for_window(*given, arch, solver, viewer, progress)
             build_s = perf_counter() - began
             if solver is None and not asked.no_pictures:
                 progress("Building the model: the first picture")
@@ -126,12 +127,18 @@ def window(asked: RehearseOptions, keys: Keys) -> Iterator["Window"]:
 
 
 def built_headless(
-    asked: RehearseOptions, scene: Scene, anatomy: LoadedAnatomy, probe: Probe, progress: ReportProgress
+    asked: RehearseOptions,
+    scene: Scene,
+    anatomy: LoadedAnatomy,
+    probe: Probe,
+    serial: bool | None,
+    progress: ReportProgress,
 ) -> "Rehearsal":
     """The rehearsal without a window."""
     from rehearsal.rehearsal import Rehearsal
 
-    return Rehearsal(scene, anatomy, probe, progress, scene.image.mode != "ct" and not asked.no_pictures)
+    needs_b_mode = scene.image.mode != "ct" and not asked.no_pictures
+    return Rehearsal(scene, anatomy, probe, progress, needs_b_mode, serial=serial)
 
 
 def built_for_window(
@@ -139,6 +146,7 @@ def built_for_window(
     scene: Scene,
     anatomy: LoadedAnatomy,
     probe: Probe,
+    serial: bool | None,
     arch: str,
     solver: "SolverProcess",
     viewer: "Window",
@@ -149,8 +157,9 @@ def built_for_window(
     from rehearsal.rehearsal import Rehearsal
 
     time_step_s = scene.solver.time_step_s if asked.rate is None else 1.0 / asked.rate
-    solver.build(scene, anatomy, probe, arch, Pace(time_step_s, asked.budget_ms or np.inf))
-    rehearsal = Rehearsal(scene, anatomy, probe, progress, scene.image.mode != "ct", settles=False)
+    solver.build(scene, anatomy, probe, arch, Pace(time_step_s, asked.budget_ms or np.inf), serial)
+    needs_b_mode = scene.image.mode != "ct"
+    rehearsal = Rehearsal(scene, anatomy, probe, progress, needs_b_mode, settles=False, serial=serial)
     progress("Building the model: the first picture")
     viewer.show_scene(geometry_of(rehearsal), initial_settings(rehearsal))
     viewer.prepare(compile_picture(rehearsal))

@@ -73,12 +73,15 @@ class PressedOrgan:
     """The solver of a scene's organ. All positions are mm relative to ``origin``, the middle of the resting organ (LPS).
 
     Taichi must be initialised, and initialised again for another scene, which frees this one. ``on_wrench`` is called after each timed step
-    with the transducer's pose (4, 4) and its ``wrench``, at the rate of the steps: for a haptic device.
+    with the transducer's pose (4, 4) and its ``wrench``, at the rate of the steps: for a haptic device. ``serial`` says whether a step is
+    computed on one core; left open, the body's size and the machine decide.
     """
 
     on_wrench: Callable[[np.ndarray, np.ndarray], None] | None = None
 
-    def __init__(self, scene: Scene, anatomy: LoadedAnatomy, probe: Probe | None = None) -> None:
+    def __init__(
+        self, scene: Scene, anatomy: LoadedAnatomy, probe: Probe | None = None, serial: bool | None = None
+    ) -> None:
         self.scene = scene
         self.probe = probe or probe_of(scene)
         self.origin = anatomy.organ.bounds.mean(axis=0)
@@ -86,7 +89,7 @@ class PressedOrgan:
         self.gravity_direction = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
         self.press = press_on(scene.press, anatomy, self.gravity_direction)
         self.cut: Cut | None = None
-        self._build_solver(anatomy)
+        self._build_solver(anatomy, serial)
         self._shapes = anatomy.shapes
         self.divergence_check = DivergenceCheck(self.solver)
         self.notice = ""
@@ -98,7 +101,7 @@ class PressedOrgan:
         """The organ's surface at rest: after a cut, of what remains."""
         return self.whole_organ if self.cut is None else self.cut.remnant
 
-    def _build_solver(self, anatomy: LoadedAnatomy) -> None:
+    def _build_solver(self, anatomy: LoadedAnatomy, serial: bool | None) -> None:
         self.size_mm = np.array(self.probe.housing_mm)
         self.tool = tool_of(self.probe)
         shapes = [*(self._shape(shape) for shape in anatomy.shapes), self.tool]
@@ -112,6 +115,7 @@ class PressedOrgan:
             self.tool,
             self.scene.contact,
             section,
+            serial,
             fixed=fixed,
             tethers=tethers,
             parts=self.parts_of_tissue,
@@ -166,7 +170,13 @@ class PressedOrgan:
     def _inputs(self) -> Iterator[object]:
         """All that the state at rest depends on."""
         sections = self.scene.model_dump_json(include={"tissue", "solver", "contact", "attachment"})
-        yield from (sections, repr(self.settings), self.young_kpa, self.press.warm_up_steps)
+        yield from (
+            sections,
+            repr(self.settings),
+            self.young_kpa,
+            self.press.warm_up_steps,
+            int(self.model.serial),
+        )
         yield from (
             self.probe.model_dump_json(),
             self.whole_organ,

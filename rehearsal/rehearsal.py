@@ -79,6 +79,7 @@ class Rehearsal(PressedOrgan):
         progress: ReportProgress = no_progress,
         needs_b_mode: bool = False,
         settles: bool = True,
+        serial: bool | None = None,
     ) -> None:
         scanned, acoustics = None, None
         if anatomy.ct is not None:
@@ -88,7 +89,7 @@ class Rehearsal(PressedOrgan):
             )
             acoustics = start_acoustics(scanned) if needs_b_mode else None
         progress("Building the model: tissue and contacts")
-        super().__init__(scene, anatomy, probe)
+        super().__init__(scene, anatomy, probe, serial)
         self.resection = NO_RESECTION
         self.score: ScoreLine | None = None
         self.score_fault = ""

@@ -60,10 +60,18 @@ class SolverLoop:
             elif self._runs and perf_counter() >= self._due_s:
                 self._keep_pace()
 
-    def build(self, scene: Scene, anatomy: LoadedAnatomy, probe: Probe, arch: str, pace: Pace) -> None:
+    def build(
+        self,
+        scene: Scene,
+        anatomy: LoadedAnatomy,
+        probe: Probe,
+        arch: str,
+        pace: Pace,
+        serial: bool | None = None,
+    ) -> None:
         """Build the solver of a scene, and send the organ at rest."""
         sim.device.start(arch)
-        self.organ, self.pace = PressedOrgan(scene, anatomy, probe), pace
+        self.organ, self.pace = PressedOrgan(scene, anatomy, probe, serial), pace
         at_rest = self.organ.settle()
         # A step and back loads the kernels, also where the state at rest was stored. The other process is not ready yet.
         self.organ.advance(self.organ.pose)

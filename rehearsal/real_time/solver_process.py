@@ -53,11 +53,20 @@ class SolverProcess:
         # The cut that the process has.
         self._cut: Cut | None = None
 
-    def build(self, scene: Scene, anatomy: LoadedAnatomy, probe: Probe, arch: str, pace: Pace) -> None:
-        """Build the solver of a scene on a backend; ``pace`` chooses its steps by the clock."""
+    def build(
+        self,
+        scene: Scene,
+        anatomy: LoadedAnatomy,
+        probe: Probe,
+        arch: str,
+        pace: Pace,
+        serial: bool | None = None,
+    ) -> None:
+        """Build the solver of a scene on a backend; ``pace`` chooses its steps by the clock, ``serial`` is as for ``PressedOrgan``."""
         asked = getattr(scene.tissue, "parts", {})
         parts = {tissue: part for tissue, part in anatomy.parts.items() if tissue in asked}
-        self._send("build", scene, replace(anatomy, ct=None, labels=None, parts=parts), probe, arch, pace)
+        without = replace(anatomy, ct=None, labels=None, parts=parts)
+        self._send("build", scene, without, probe, arch, pace, serial)
 
     def settled(self) -> OrganState:
         """Return the organ at rest, as soon as it is known."""

@@ -144,6 +144,7 @@ def record(
         probe=rehearsal.probe.model_dump(mode="json", by_alias=True),
         arch=arch,
         time_step_s=rehearsal.settings.time_step_s,
+        serial=rehearsal.model.serial,
         begins=None if begins is None else pack_state(begins),
     )
     path = folder / f"session-{next_number(folder, NAME):03d}.jsonl"

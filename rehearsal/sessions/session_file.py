@@ -58,6 +58,8 @@ class Header(_Line):
     probe: dict[str, Any]
     arch: str = Field(pattern=r"^[0-9a-z_]{1,20}$")
     time_step_s: float = Field(ge=LEAST_STEP_S, le=MOST_STEP_S)
+    serial: bool | None = None
+    """Whether a step was computed on one core: its bits depend on that, and machines differ in it."""
     begins: str | None = None
     """The state that it begins with, where that is not the settled one."""
 

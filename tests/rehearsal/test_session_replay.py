@@ -13,6 +13,7 @@ from coarse_patient import coarse_patient
 from null_viewer import NullViewer
 from one_step_solver import OneStepSolver
 
+import app
 from rehearsal import headless, run
 from rehearsal.asked_files import AskedFiles
 from rehearsal.build_solver import step_settings
@@ -241,3 +242,22 @@ FILES = ["organ.ply", "report.json", "tumour.ply"]
 
 def no_vulkan(rehearsal: Rehearsal, visible: bool) -> None:
     raise NoVulkan("none")
+
+
+def test_a_session_is_replayed_in_parallel_or_on_one_core_as_it_was_recorded(tmp_path, monkeypatch, capsys):
+    """Recorded on a machine with many cores, whose steps have other bits than those on one core."""
+    short = ["--headless", "--no-pictures", "--cell", "7", "--arch", "cpu"]
+    with monkeypatch.context() as patch:
+        patch.setattr("sim.neo_hookean.is_too_small", lambda *given: False)
+        assert app.main(["rehearse", *short, "--seconds", "2.1", "--out", str(tmp_path)]) == 0
+    session = tmp_path / "session-001.jsonl"
+    assert '"serial":false' in session.read_text("utf-8").splitlines()[0]
+    other = tmp_path / "session-002.jsonl"
+    other.write_text(session.read_text("utf-8").replace('"serial":false', '"serial":true', 1), "utf-8")
+    verdicts = []
+    for path in (session, other):
+        capsys.readouterr()
+        out = str(tmp_path / path.stem)
+        assert app.main(["rehearse", *short[:2], "--replay", str(path), "--arch", "cpu", "--out", out]) == 0
+        verdicts += [line for line in capsys.readouterr().out.splitlines() if line.startswith("replay ")]
+    assert "identical in all 3 states" in verdicts[0] and "differs" in verdicts[1]
