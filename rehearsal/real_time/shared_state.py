@@ -1,8 +1,10 @@
-"""The state of an organ in memory that two processes share, written and read whole: a picture shows one instant."""
+"""States of an organ in memory that two processes share: one writes them in turn to a few slots, the other reads the newest whole.
+
+Without a lock, which a process that is killed would keep: a slot is written again only SLOTS states later, and the reader sees whether it was.
+"""
 
 from collections.abc import Mapping
 from multiprocessing.shared_memory import SharedMemory
-from multiprocessing.synchronize import Lock
 
 import numpy as np
 
@@ -12,24 +14,34 @@ from sim.divergence_check import DivergenceState
 from sim.solver import SolverState
 
 Arrays = dict[str, np.ndarray]
-# Number of the state and of the good state in it, and the counts of organ and divergence check.
-NUMBERS = 6
+# A copy takes less time than as many steps.
+SLOTS = 3
+# Of each state: the number of the good state in it, and the counts of organ and divergence check.
+NUMBERS = 5
 
 
 class SharedState:
     """Memory for the states of one organ, of the sizes of ``like``; ``name`` is that of memory that another process has made.
 
-    Each state has a number, which the writer gives.
+    Each state has a number, which the writer gives: one more than the one before.
     """
 
-    def __init__(self, like: OrganState, lock: Lock, name: str | None = None) -> None:
-        self._lock, self._is_owner = lock, name is None
-        head = dict(numbers=np.zeros(NUMBERS, np.int64), pose=np.zeros((4, 4)))
-        parts = head, _arrays_of(like.solver), _arrays_of(like.divergence.good)
+    def __init__(self, like: OrganState, name: str | None = None) -> None:
+        self._is_owner = name is None
+        slot = (
+            dict(numbers=np.zeros(NUMBERS, np.int64), pose=np.zeros((4, 4))),
+            _arrays_of(like.solver),
+            _arrays_of(like.divergence.good),
+        )
+        parts = dict(begun=np.zeros(1, np.int64)), *(SLOTS * slot)
         size = sum(each.nbytes for part in parts for each in part.values())
         self._memory = SharedMemory(name, create=self._is_owner, size=size)
-        self._head, self._now, self._good = self._views(parts)
+        (head, *slots) = self._views(parts)
+        self._begun = head["begun"]
+        self._slots = [slots[n : n + len(slot)] for n in range(0, len(slots), len(slot))]
+        # The good state that was written or read last, and the number of that in each slot.
         self._last_good, self._good_number = like.divergence.good, 0
+        self._written_good = [-1] * SLOTS
 
     @property
     def name(self) -> str:
@@ -48,30 +60,36 @@ class SharedState:
         return views
 
     def write(self, state: OrganState, number: int) -> None:
-        """Write a state."""
+        """Write a state. The reader must be told its number afterwards."""
+        self._begun[0] = number
+        head, now, good = self._slots[number % SLOTS]
         check = state.divergence
-        with self._lock:
-            _copy(_arrays_of(state.solver), self._now)
-            if check.good is not self._last_good:
-                self._last_good, self._good_number = check.good, self._good_number + 1
-                _copy(_arrays_of(check.good), self._good)
-            counts = state.steps, check.steps_since_good, check.steps_tangled, check.is_restored
-            self._head["numbers"][:] = number, self._good_number, *counts
-            self._head["pose"][:] = state.pose
+        _copy(_arrays_of(state.solver), now)
+        if check.good is not self._last_good:
+            self._last_good, self._good_number = check.good, self._good_number + 1
+        if self._written_good[number % SLOTS] != self._good_number:
+            self._written_good[number % SLOTS] = self._good_number
+            _copy(_arrays_of(check.good), good)
+        counts = state.steps, check.steps_since_good, check.steps_tangled, check.is_restored
+        head["numbers"][:] = self._good_number, *counts
+        head["pose"][:] = state.pose
 
-    def read(self) -> tuple[OrganState, int]:
-        """Return a copy of the last state, and its number."""
-        with self._lock:
-            solver, pose = _solver_state(self._now), self._head["pose"].copy()
-            number, good_number, steps, since_good, tangled, restored = map(int, self._head["numbers"])
-            if good_number != self._good_number:
-                self._last_good, self._good_number = _solver_state(self._good), good_number
-        check = DivergenceState(self._last_good, since_good, tangled, bool(restored))
-        return OrganState(solver, check, pose, steps), number
+    def read(self, number: int) -> OrganState | None:
+        """Return a copy of the state with a number that the writer has told; None where a newer one has taken its slot."""
+        head, now, good = self._slots[number % SLOTS]
+        solver, pose = _solver_state(now), head["pose"].copy()
+        good_number, steps, since_good, tangled, restored = map(int, head["numbers"])
+        last_good = self._last_good if good_number == self._good_number else _solver_state(good)
+        if self._begun[0] >= number + SLOTS:
+            return None
+        self._last_good, self._good_number = last_good, good_number
+        return OrganState(
+            solver, DivergenceState(last_good, since_good, tangled, bool(restored)), pose, steps
+        )
 
     def close(self) -> None:
         """Release the memory; its arrays must not be used any more."""
-        self._head, self._now, self._good = {}, {}, {}
+        self._begun, self._slots = np.zeros(1, np.int64), []
         self._memory.close()
         if self._is_owner:
             self._memory.unlink()

@@ -4,7 +4,6 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 from multiprocessing.connection import Connection
-from multiprocessing.synchronize import Lock
 from time import perf_counter
 
 import numpy as np
@@ -26,10 +25,10 @@ MOST_BEHIND_S = 0.1
 PAUSED = "paused"
 
 
-def compute(connection: Connection, lock: Lock, parent: int) -> None:
+def compute(connection: Connection, parent: int) -> None:
     """Serve requests until ``stop``. The parent is a process id."""
     end_with_parent(parent)
-    SolverLoop(connection, lock).serve()
+    SolverLoop(connection).serve()
 
 
 class SolverLoop:
@@ -39,8 +38,8 @@ class SolverLoop:
     pace: Pace
     _memory: SharedState
 
-    def __init__(self, connection: Connection, lock: Lock) -> None:
-        self._connection, self._lock = connection, lock
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
         self._path = PosePath(np.eye(4))
         self._played: deque[tuple[np.ndarray, float]] = deque()
         self._runs = self._is_stopped = False
@@ -80,7 +79,7 @@ class SolverLoop:
 
     def share(self, memory: str) -> None:
         """Write all states to a memory from now on."""
-        self._memory = SharedState(self.organ.snapshot_of_organ(), self._lock, memory)
+        self._memory = SharedState(self.organ.snapshot_of_organ(), memory)
 
     def take_over(self, state: OrganState, settings: StepSettings, young_kpa: float | None) -> None:
         """Continue from a state, with settings."""

@@ -77,7 +77,7 @@ class SolverProcess:
         self.rehearsal = rehearsal
         if self._memory is not None:
             self._memory.close()
-        self._memory = SharedState(rehearsal.snapshot_of_organ(), self._started.lock)
+        self._memory = SharedState(rehearsal.snapshot_of_organ())
         self._send("share", self._memory.name)
 
     def collect(self) -> None:
@@ -149,9 +149,8 @@ class SolverProcess:
         """Set the rehearsal to the newest state, and hand on the steps up to it."""
         if self._memory is None or not self._uncollected:
             return
-        # A state is written before its step is sent.
-        state, number = self._memory.read()
-        while self._received < number:
+        # A state is written before its step is sent. If newer ones have taken its place, their steps are on the way.
+        while (state := self._memory.read(self._received)) is None:
             self._receive_step()
         self.rehearsal.restore_organ(state)
         self.pending = max(0, self.pending - len(self._uncollected))

@@ -12,7 +12,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from multiprocessing.synchronize import Lock
 
 # How long the process may take to end in order.
 END_S = 2.0
@@ -20,11 +19,10 @@ END_S = 2.0
 
 @dataclass(frozen=True)
 class StartedProcess:
-    """A process that waits for requests on a connection; the lock is for the memory that it shares."""
+    """A process that waits for requests on a connection."""
 
     process: BaseProcess
     connection: Connection
-    lock: Lock
 
     def close(self) -> None:
         """End the process in order, so that it stores its kernels."""
@@ -43,12 +41,11 @@ def start_process() -> StartedProcess:
     """Start the process of a solver."""
     context = multiprocessing.get_context("spawn")
     connection, theirs = context.Pipe()
-    lock = context.Lock()
-    process = context.Process(target=_compute, args=(theirs, lock, os.getpid()), name="solver", daemon=True)
+    process = context.Process(target=_compute, args=(theirs, os.getpid()), name="solver", daemon=True)
     with _without_interrupts():
         process.start()
     theirs.close()
-    return StartedProcess(process, connection, lock)
+    return StartedProcess(process, connection)
 
 
 @contextmanager
@@ -75,9 +72,9 @@ def started_process(is_needed: bool) -> Iterator[StartedProcess | None]:
             started.kill()
 
 
-def _compute(connection: Connection, lock: Lock, parent: int) -> None:
+def _compute(connection: Connection, parent: int) -> None:
     # Where processes do not inherit this.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     from rehearsal.real_time.solver_loop import compute
 
-    compute(connection, lock, parent)
+    compute(connection, parent)

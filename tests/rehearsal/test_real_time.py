@@ -5,16 +5,18 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
 from conftest import rotation_about
 
-from rehearsal.pressed_organ import PressedOrgan, Step
+from rehearsal.pressed_organ import OrganState, PressedOrgan, Step
 from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.real_time.pace import BUSY, LEAST_ITERATIONS, SPARE, STEPS_DOWN, STEPS_UP, Pace
 from rehearsal.real_time.pose_path import CATCH_UP, LONGEST_S, PosePath
+from rehearsal.real_time.shared_state import SLOTS, SharedState
 from rehearsal.real_time.solver_loop import SolverLoop
 from rehearsal.real_time.solver_process import SolverEnded, SolverProcess
 from rehearsal.real_time.started_process import start_process
@@ -23,7 +25,7 @@ from scenes.anatomy import LoadedAnatomy
 from scenes.scene import AnatomyFiles, Attachment, Scene, with_options
 from scenes.tissue import NeoHookeanTissue
 from sim import stored_arrays
-from sim.solver import StepSettings
+from sim.solver import SolverState, StepSettings
 from ultrasound.probe_manipulator import advanced
 
 # A process that makes a step of a small body in less than a millisecond; the machine may be busy.
@@ -102,6 +104,37 @@ def test_each_state_is_of_one_instant_and_has_the_bits_of_the_same_steps_here(so
         assert reference.digest() == digest
     assert sum(len(steps) for steps, _ in frames) >= 300 and moved > 0.01
     assert np.array_equal(reference.pose, solver.rehearsal.pose)
+
+
+def numbered(state: OrganState, number: int, good: SolverState | None = None) -> OrganState:
+    """A state whose positions are its number, and of the same good state or another."""
+    body = replace(state.solver.body, position=np.full_like(state.solver.body.position, number))
+    divergence = replace(state.divergence, good=good or state.divergence.good, steps_since_good=number)
+    pose = np.full((4, 4), float(number))
+    return OrganState(replace(state.solver, body=body), divergence, pose, number)
+
+
+def test_states_in_shared_memory_are_read_whole_or_not_at_all(reference):
+    at_rest = reference.snapshot_of_organ()
+    reader = SharedState(at_rest)
+    writer = SharedState(at_rest, reader.name)
+    good = numbered(at_rest, 77).solver
+    for number in range(1, 8):
+        writer.write(numbered(at_rest, number, good if number >= 5 else None), number)
+        for told in range(max(1, number - SLOTS + 1), number + 1):
+            state = reader.read(told)
+            assert (state.solver.body.position == told).all() and (state.pose == told).all()
+            assert state.steps == state.divergence.steps_since_good == told
+            wanted = good if told >= 5 else at_rest.divergence.good
+            assert np.array_equal(state.divergence.good.body.position, wanted.body.position)
+        if number > SLOTS:
+            assert reader.read(number - SLOTS) is None
+    # The writer is killed while it writes: what it has told before is still there, and nobody waits.
+    writer._begun[0] = 8
+    writer._slots[8 % SLOTS][1]["position"][:] = -1.0
+    assert (reader.read(7).solver.body.position == 7).all() and reader.read(5) is None
+    writer.close()
+    reader.close()
 
 
 def test_steps_keep_pace_with_the_clock(solver):
@@ -218,7 +251,7 @@ class ClockedLoop(SolverLoop):
     ) -> None:
         self.now_s, self.begun, self.hangs_s = 0.0, [], hangs_s
         monkeypatch.setattr("rehearsal.real_time.solver_loop.perf_counter", lambda: self.now_s)
-        super().__init__(self, None)
+        super().__init__(self)
         poses = [np.eye(4) + np.eye(4, k=3) * number for number in range(1, len(inputs_s) + 1)]
         self.requests = [("go_to", (pose, at_s, 0.0)) for pose, at_s in zip(poses, inputs_s, strict=True)]
         self.times_s = [*inputs_s, end_s, np.inf]
