@@ -60,14 +60,15 @@ class Health:
 
 @dataclass(frozen=True)
 class DivergenceState:
-    """State of the check between steps: the last good state, the steps since then and since the tissue is tangled, and whether
-    that state has been restored since.
+    """State of the check between steps: the last good state, the steps since then and since the tissue is tangled, whether that state has
+    been restored since, and the time [s] since then.
     """
 
     good: SolverState
     steps_since_good: int = 0
     steps_tangled: int = 0
     is_restored: bool = False
+    since_good_s: float = 0.0
 
 
 class DivergenceCheck:
@@ -129,18 +130,19 @@ class DivergenceCheck:
             self.state,
             steps_since_good=self.state.steps_since_good + 1,
             steps_tangled=self.state.steps_tangled + 1 if is_tangled else 0,
+            since_good_s=self.state.since_good_s + time_step_s,
         )
         patience = max(PATIENCE_STEPS, round(PATIENCE_S / time_step_s))
         if health.is_lost or state.steps_tangled > patience:
-            return self._restore(health.fault, time_step_s)
+            return self._restore(health.fault, state.since_good_s)
         if health.tangled == 0.0 and state.steps_since_good >= max(KEEP_STEPS, round(KEEP_S / time_step_s)):
             state = DivergenceState(self.solver.snapshot())
         self.state = state
         return ""
 
-    def _restore(self, fault: str, time_step_s: float) -> str:
+    def _restore(self, fault: str, since_good_s: float) -> str:
         """Restore the last good state with zero velocity; if that was already restored, the initial state."""
-        state, where = self.state.good, f"as it was {self.state.steps_since_good * time_step_s:.1f} s before"
+        state, where = self.state.good, f"as it was {since_good_s:.1f} s before"
         if self.state.is_restored:
             state, where = self.initial, "as it was at the start"
         still = replace(state.body, velocity=np.zeros_like(state.body.velocity))

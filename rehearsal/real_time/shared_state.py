@@ -29,7 +29,7 @@ class SharedState:
     def __init__(self, like: OrganState, name: str | None = None) -> None:
         self._is_owner = name is None
         slot = (
-            dict(numbers=np.zeros(NUMBERS, np.int64), pose=np.zeros((4, 4))),
+            dict(numbers=np.zeros(NUMBERS, np.int64), since_good_s=np.zeros(1), pose=np.zeros((4, 4))),
             _arrays_of(like.solver),
             _arrays_of(like.divergence.good),
         )
@@ -72,20 +72,19 @@ class SharedState:
             _copy(_arrays_of(check.good), good)
         counts = state.steps, check.steps_since_good, check.steps_tangled, check.is_restored
         head["numbers"][:] = self._good_number, *counts
-        head["pose"][:] = state.pose
+        head["since_good_s"][0], head["pose"][:] = check.since_good_s, state.pose
 
     def read(self, number: int) -> OrganState | None:
         """Return a copy of the state with a number that the writer has told; None where a newer one has taken its slot."""
         head, now, good = self._slots[number % SLOTS]
-        solver, pose = _solver_state(now), head["pose"].copy()
+        solver, pose, since_good_s = _solver_state(now), head["pose"].copy(), float(head["since_good_s"][0])
         good_number, steps, since_good, tangled, restored = map(int, head["numbers"])
         last_good = self._last_good if good_number == self._good_number else _solver_state(good)
         if self._begun[0] >= number + SLOTS:
             return None
         self._last_good, self._good_number = last_good, good_number
-        return OrganState(
-            solver, DivergenceState(last_good, since_good, tangled, bool(restored)), pose, steps
-        )
+        check = DivergenceState(last_good, since_good, tangled, bool(restored), since_good_s)
+        return OrganState(solver, check, pose, steps)
 
     def close(self) -> None:
         """Release the memory; its arrays must not be used any more."""

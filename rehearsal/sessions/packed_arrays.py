@@ -155,6 +155,7 @@ def pack_state(state: RehearsalState) -> str:
         **({} if all(map(np.array_equal, now.values(), good.values())) else good),
         "pose": state.pose,
         **{f"grip.{name}": value for name, value in asdict(state.manipulator).items() if value is not None},
+        "since_good_s": watch.since_good_s,
         "numbers": [state.steps, watch.steps_since_good, watch.steps_tangled, watch.is_restored],
         **_of_resection(state.resection),
     }
@@ -173,7 +174,11 @@ def unpack_state(text: str, like: RehearsalState) -> RehearsalState:
         now = _solver(arrays, "now", like.solver)
         steps, since_good, tangled, restored = map(int, arrays["numbers"])
         good = _solver(arrays, "good", like.solver) if "good.position" in arrays else now
-        watch = DivergenceState(good, since_good, tangled, bool(restored))
+        # Not in older sessions.
+        since_good_s = float(arrays.get("since_good_s", 0.0))
+        if not np.isfinite(since_good_s):
+            raise StateError("a time that is not finite")
+        watch = DivergenceState(good, since_good, tangled, bool(restored), since_good_s)
         turn = tuple(map(float, arrays["grip.turn_deg"].reshape(3)))
         depth, pressed = float(arrays["grip.depth_mm"]), float(arrays["grip.pressed_mm"])
         aim = _pose(arrays, "grip.aim") if "grip.aim" in arrays else None

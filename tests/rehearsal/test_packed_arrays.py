@@ -39,7 +39,7 @@ def test_a_state_as_text_keeps_every_bit(aim):
     numbers = Numbers()
     for _ in range(15):
         numbers.advance(numbers.pose_towards(np.eye(4)))
-    numbers.watch = replace(numbers.watch, steps_tangled=3, is_restored=True)
+    numbers.watch = replace(numbers.watch, steps_tangled=3, is_restored=True, since_good_s=1 / 3)
     numbers.velocity = np.array([[-0.0, 1e-45, np.inf], [np.nan, 1 / 3, -7]], np.float32)
     numbers.manipulator.state = ManipulatorState(0.1, 2.3, (1 / 3, -4.0, 5.0), aim)
     cut = CutRequest(CutSettings("wedge", 1 / 3, None, "air"), b"\x05", before_cut(numbers).tobytes())
@@ -47,9 +47,9 @@ def test_a_state_as_text_keeps_every_bit(aim):
     pairs = list(
         zip(arrays_of(before), arrays_of(unpack_state(pack_state(before), numbers.settled)), strict=True)
     )
-    # Now and when last good: position, velocity and contacts; the watch's three; pose, steps; the hand's four; marks, and of the cut its
+    # Now and when last good: position, velocity and contacts; the watch's four; pose, steps; the hand's four; marks, and of the cut its
     # four settings, what was seen, and the nodes.
-    assert len(pairs) == 2 * 3 + 3 + 2 + 4 + 1 + 4 + 2
+    assert len(pairs) == 2 * 3 + 4 + 2 + 4 + 1 + 4 + 2
     assert all(old.dtype == new.dtype and old.tobytes() == new.tobytes() for old, new in pairs)
 
 
@@ -68,7 +68,11 @@ def test_what_is_no_state_of_this_body_is_refused(monkeypatch):
     for name, array in arrays.items():
         others = np.array(["a"]), np.array([{}]), np.stack([array, array])
         hostile += [packed(**arrays | {name: other}) for other in others]
-        hostile.append(packed(**{key: values for key, values in arrays.items() if key != name}))
+        without = packed(**{key: values for key, values in arrays.items() if key != name})
+        if name == "since_good_s":  # older sessions have none
+            assert unpack_state(without, numbers.settled).divergence.since_good_s == 0.0
+        else:
+            hostile.append(without)
     huge, npy = io.BytesIO(), io.BytesIO()
     np.lib.format.write_array_header_1_0(npy, dict(descr="<f8", fortran_order=False, shape=(10**15,)))
     with zipfile.ZipFile(huge, "w") as members:

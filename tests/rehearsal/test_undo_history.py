@@ -31,6 +31,7 @@ class Numbers:
     """A rehearsal whose tissue is two points, moved by all that a step is told; the hand over it, and its ball, are real."""
 
     origin = np.zeros(3)
+    model = SimpleNamespace(serial=True)
 
     def __init__(self) -> None:
         self.settings = StepSettings(time_step_s=STEP_S)

@@ -190,6 +190,16 @@ def test_one_number_of_one_point_is_found(kept, ball, value, axis):
     assert divergence_check.health().finite and divergence_check.health().is_lost
 
 
+def test_how_long_ago_a_restored_state_was_is_the_sum_of_the_steps_whatever_their_length(kept, ball):
+    solver = on_floor(kept, "neo-hookean", ball)
+    divergence_check = DivergenceCheck(solver)
+    for length_s in (1 / 60, 1 / 15, 1 / 20, 1 / 15):
+        assert divergence_check.check(length_s) == ""
+    put(solver, np.full(solver.snapshot().body.position.shape, np.nan))
+    # Four steps of 0.2 s in all, and the one that diverged.
+    assert "as it was 0.3 s before" in divergence_check.check(0.1)
+
+
 @pytest.mark.parametrize("model", MODELS)
 def test_torn_points_stay_finite(kept, ball, model):
     solver = on_floor(kept, model, ball)
