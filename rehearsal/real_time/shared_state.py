@@ -60,7 +60,7 @@ class SharedState:
         return views
 
     def write(self, state: OrganState, number: int) -> None:
-        """Write a state. The reader must be told its number afterwards."""
+        """Write a state; send its number to the reader afterwards."""
         self._begun[0] = number
         head, now, good = self._slots[number % SLOTS]
         check = state.divergence
@@ -75,7 +75,7 @@ class SharedState:
         head["since_good_s"][0], head["pose"][:] = check.since_good_s, state.pose
 
     def read(self, number: int) -> OrganState | None:
-        """Return a copy of the state with a number that the writer has told; None where a newer one has taken its slot."""
+        """Return a copy of the state of a number that the writer has sent; None where a newer one has taken its slot."""
         head, now, good = self._slots[number % SLOTS]
         solver, pose, since_good_s = _solver_state(now), head["pose"].copy(), float(head["since_good_s"][0])
         good_number, steps, since_good, tangled, restored = map(int, head["numbers"])

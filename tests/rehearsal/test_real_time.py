@@ -121,15 +121,15 @@ def test_states_in_shared_memory_are_read_whole_or_not_at_all(reference):
     good = numbered(at_rest, 77).solver
     for number in range(1, 8):
         writer.write(numbered(at_rest, number, good if number >= 5 else None), number)
-        for told in range(max(1, number - SLOTS + 1), number + 1):
-            state = reader.read(told)
-            assert (state.solver.body.position == told).all() and (state.pose == told).all()
-            assert state.steps == state.divergence.steps_since_good == told
-            wanted = good if told >= 5 else at_rest.divergence.good
+        for earlier in range(max(1, number - SLOTS + 1), number + 1):
+            state = reader.read(earlier)
+            assert (state.solver.body.position == earlier).all() and (state.pose == earlier).all()
+            assert state.steps == state.divergence.steps_since_good == earlier
+            wanted = good if earlier >= 5 else at_rest.divergence.good
             assert np.array_equal(state.divergence.good.body.position, wanted.body.position)
         if number > SLOTS:
             assert reader.read(number - SLOTS) is None
-    # The writer is killed while it writes: what it has told before is still there, and nobody waits.
+    # The writer is killed while it writes: the states before are still there, and nobody waits.
     writer._begun[0] = 8
     writer._slots[8 % SLOTS][1]["position"][:] = -1.0
     assert (reader.read(7).solver.body.position == 7).all() and reader.read(5) is None
