@@ -154,10 +154,12 @@ def built_for_window(
 ) -> "Rehearsal":
     """The rehearsal that a window shows. While the process of the solver brings the tissue to rest, this one prepares the first picture."""
     from rehearsal.open_window import geometry_of, initial_settings
+    from rehearsal.real_time.solver_loop import SolverSetup
     from rehearsal.rehearsal import Rehearsal
 
     time_step_s = scene.solver.time_step_s if asked.rate is None else 1.0 / asked.rate
-    solver.build(scene, anatomy, probe, arch, Pace(time_step_s, asked.budget_ms or np.inf), serial)
+    pace = Pace(time_step_s, asked.budget_ms or np.inf)
+    solver.build(SolverSetup(scene, anatomy, probe, arch, pace, serial))
     needs_b_mode = scene.image.mode != "ct"
     rehearsal = Rehearsal(scene, anatomy, probe, progress, needs_b_mode, settles=False, serial=serial)
     progress("Building the model: the first picture")

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from time import perf_counter
 
@@ -23,6 +23,18 @@ from ultrasound.probe import Probe
 # Time by which the simulation may be behind the clock and still catch up; more is lost: slow motion.
 MOST_BEHIND_S = 0.1
 PAUSED = "paused"
+
+
+@dataclass(frozen=True)
+class SolverSetup:
+    """What the solver is built of, and the backend; ``pace`` chooses its steps by the clock, ``serial`` is as for ``PressedOrgan``."""
+
+    scene: Scene
+    anatomy: LoadedAnatomy
+    probe: Probe
+    arch: str
+    pace: Pace
+    serial: bool | None = None
 
 
 def compute(connection: Connection, parent: int) -> None:
@@ -59,18 +71,11 @@ class SolverLoop:
             elif self._runs and perf_counter() >= self._due_s:
                 self._keep_pace()
 
-    def build(
-        self,
-        scene: Scene,
-        anatomy: LoadedAnatomy,
-        probe: Probe,
-        arch: str,
-        pace: Pace,
-        serial: bool | None = None,
-    ) -> None:
+    def build(self, setup: SolverSetup) -> None:
         """Build the solver of a scene, and send the organ at rest."""
-        sim.device.start(arch)
-        self.organ, self.pace = PressedOrgan(scene, anatomy, probe, serial), pace
+        sim.device.start(setup.arch)
+        self.organ = PressedOrgan(setup.scene, setup.anatomy, setup.probe, setup.serial)
+        self.pace = setup.pace
         at_rest = self.organ.settle()
         # A step and back loads the kernels, also where the state at rest was stored. The other process is not ready yet.
         self.organ.advance(self.organ.pose)

@@ -14,15 +14,11 @@ import numpy as np
 
 from errors import UserError
 from rehearsal.pressed_organ import OrganState, Step
-from rehearsal.real_time.pace import Pace
 from rehearsal.real_time.shared_state import SharedState
-from rehearsal.real_time.solver_loop import PAUSED
+from rehearsal.real_time.solver_loop import PAUSED, SolverSetup
 from rehearsal.real_time.started_process import END_S, StartedProcess
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.cut import Cut
-from scenes.anatomy import LoadedAnatomy
-from scenes.scene import Scene
-from ultrasound.probe import Probe
 
 # How long a picture waits for the step that shows its input.
 MOST_WAIT_S = 0.1
@@ -53,20 +49,11 @@ class SolverProcess:
         # The cut that the process has.
         self._cut: Cut | None = None
 
-    def build(
-        self,
-        scene: Scene,
-        anatomy: LoadedAnatomy,
-        probe: Probe,
-        arch: str,
-        pace: Pace,
-        serial: bool | None = None,
-    ) -> None:
-        """Build the solver of a scene on a backend; ``pace`` chooses its steps by the clock, ``serial`` is as for ``PressedOrgan``."""
-        asked = getattr(scene.tissue, "parts", {})
-        parts = {tissue: part for tissue, part in anatomy.parts.items() if tissue in asked}
-        without = replace(anatomy, ct=None, labels=None, parts=parts)
-        self._send("build", scene, without, probe, arch, pace, serial)
+    def build(self, setup: SolverSetup) -> None:
+        """Build the solver of a scene."""
+        own = getattr(setup.scene.tissue, "parts", {})
+        parts = {tissue: part for tissue, part in setup.anatomy.parts.items() if tissue in own}
+        self._send("build", replace(setup, anatomy=replace(setup.anatomy, ct=None, labels=None, parts=parts)))
 
     def settled(self) -> OrganState:
         """Return the organ at rest, as soon as it is known."""

@@ -20,6 +20,7 @@ from rehearsal.open_window import initial_settings
 from rehearsal.opening import compile_picture
 from rehearsal.planning.plan_file import Plan
 from rehearsal.real_time.pace import Pace
+from rehearsal.real_time.solver_loop import SolverSetup
 from rehearsal.real_time.solver_process import SolverProcess
 from rehearsal.real_time.started_process import start_process
 from rehearsal.rehearsal import Rehearsal
@@ -121,7 +122,7 @@ PACES = {
 def test_every_tool_works_at_every_pace(built, process, tmp_path, capsys, pace):
     rehearsal, anatomy = built
     make_pace, said, times_longer = PACES[pace]
-    process.build(rehearsal.scene, anatomy, rehearsal.probe, "cpu", make_pace())
+    process.build(SolverSetup(rehearsal.scene, anatomy, rehearsal.probe, "cpu", make_pace()))
     rehearsal.settings = step_settings(rehearsal.scene.tissue, rehearsal.scene.solver)
     rehearsal.take_settled(process.settled())
     process.attach(rehearsal)

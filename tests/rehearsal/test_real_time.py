@@ -17,7 +17,7 @@ from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.real_time.pace import BUSY, LEAST_ITERATIONS, SPARE, STEPS_DOWN, STEPS_UP, Pace
 from rehearsal.real_time.pose_path import CATCH_UP, LONGEST_S, PosePath
 from rehearsal.real_time.shared_state import SLOTS, SharedState
-from rehearsal.real_time.solver_loop import SolverLoop
+from rehearsal.real_time.solver_loop import SolverLoop, SolverSetup
 from rehearsal.real_time.solver_process import SolverEnded, SolverProcess
 from rehearsal.real_time.started_process import start_process
 from rehearsal.rehearsal import Rehearsal
@@ -58,7 +58,7 @@ def started(one_device) -> Iterator[SolverProcess]:
     solver = SolverProcess(start_process())
     copy = small_rehearsal()
     anatomy = LoadedAnatomy(trimesh.creation.icosphere(subdivisions=3, radius=15.0), None, None, ())
-    solver.build(copy.scene, anatomy, copy.probe, "cpu", Pace(1 / RATE))
+    solver.build(SolverSetup(copy.scene, anatomy, copy.probe, "cpu", Pace(1 / RATE)))
     copy.take_settled(solver.settled())
     solver.attach(copy)
     yield solver

@@ -151,7 +151,7 @@ def test_a_cut_keeps_the_margin_and_undo_brings_all_back_bit_for_bit(rehearsal, 
     assert all(np.array_equal(image[name], again[name]) for name in image)
     moved(live, redo=True)
     moved(live, redo=True)
-    # The same cut again, with other surfaces: who draws the old ones is told by their version.
+    # The same cut again, with other surfaces: their version shows it to what draws them.
     cut, version, drawn = rehearsal.cut, rehearsal.geometry_version, rehearsal.organ_skin
     moved(live, undo=True)
     moved(live, redo=True)
