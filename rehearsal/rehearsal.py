@@ -132,18 +132,18 @@ class Rehearsal(PressedOrgan):
         """The surfaces that move with the tissue: of the organ, and of its tumour and other parts by tissue."""
         self.tumour = remains.get(TUMOUR)
         self.parts = {tissue: part for tissue, part in remains.items() if tissue != TUMOUR}
-        self.organ_skin = Skin(self.model, self.organ.vertices)
+        self.organ_skin = Skin(self.model.carrier, self.organ.vertices)
         self.tumour_skin = self._tumour_border = None
         if self.tumour is not None:
-            self._tumour_border = Skin(self.model, self.tumour.vertices)
+            self._tumour_border = Skin(self.model.carrier, self.tumour.vertices)
             drawn = self.tumour.vertices + TUMOUR_LIFT_MM * self.tumour.vertex_normals
-            self.tumour_skin = Skin(self.model, drawn)
-        self.part_skins = {tissue: Skin(self.model, part.vertices) for tissue, part in self.parts.items()}
+            self.tumour_skin = Skin(self.model.carrier, drawn)
+        self.part_skins = {tissue: Skin(self.model.carrier, part.vertices) for tissue, part in self.parts.items()}
 
     def _build_scanner(self, scanned: ScannedAnatomy | None, acoustics: Future[np.ndarray] | None) -> None:
         image = self.scene.image
         margin = SURROUNDINGS_MM if shows_ct(image.outside) else 0.0
-        self.embedding = Embedding(self.model, self.organ, embedding_cell_mm(self.scene.tissue), margin)
+        self.embedding = Embedding(self.model.carrier, self.organ, embedding_cell_mm(self.scene.tissue), margin)
         self.scanner = None
         if scanned is not None:
             around = image.outside, image.contact, image.coupling_gap_mm
@@ -218,7 +218,7 @@ class Rehearsal(PressedOrgan):
             except ResectionError as error:
                 self.score_fault = str(error)
         shown = marks if self.score is None else np.concatenate([self.score.points, self.score.marks])
-        self._score_points = Skin(self.model, shown) if len(marks) else None
+        self._score_points = Skin(self.model.carrier, shown) if len(marks) else None
 
     def score_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Present places [mm] of the score: points (k, 3) of the closed line, and its marks (n, 3)."""

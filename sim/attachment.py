@@ -72,7 +72,7 @@ class PerirenalFat:
         faces = np.asarray(surface.faces, np.int64)
         face = igl.point_mesh_squared_distance(points, np.asarray(surface.vertices, float), faces)[1]
         covered = surface.face_normals[face] @ self.exposed <= 0
-        nodes, weights = lattice.interpolation(points)
+        nodes, weights = lattice.interpolation.attach(points)
         per_point = 1e-3 * self.stiffness_kpa_mm * area_mm2 * covered
         return np.bincount(nodes.ravel(), (per_point[:, None] * weights).ravel(), len(lattice.nodes))
 

@@ -15,9 +15,8 @@ from sim.device import is_too_small
 from sim.fields import Field, field_of, fill, zeros
 from sim.kernels import kernel
 from sim.signed_distance import signed_distance
-from sim.skinning import Skin
+from sim.skinning import Carrier, Skin
 from sim.stored_arrays import stored
-from sim.tissue_model import TissueModel
 
 # Barycentric tolerance, so that rounding leaves no gaps between tetrahedra.
 SEAM = 1e-5
@@ -30,7 +29,7 @@ PARALLEL_FROM = 1_000_000
 
 
 class Embedding:
-    """Tetrahedra of a regular grid around a closed surface, whose vertices move with the tissue model.
+    """Tetrahedra of a regular grid around a closed surface, whose vertices move with the tissue.
 
     ``tetrahedron`` (m,): four vertex indices each, of a rest mesh without gaps (Kuhn's six tetrahedra per cell). Outside the
     body they move with the nearest point of its surface, but less with the distance and not at all at ``margin_mm``, so that the
@@ -41,10 +40,10 @@ class Embedding:
     """
 
     def __init__(
-        self, model: TissueModel, surface: trimesh.Trimesh, cell_mm: float, margin_mm: float = 0.0
+        self, carrier: Carrier, surface: trimesh.Trimesh, cell_mm: float, margin_mm: float = 0.0
     ) -> None:
         vertices, tetrahedra, share, at = stored(_embedding_mesh, surface, cell_mm, margin_mm)
-        self.skin = Skin(model, vertices, at)
+        self.skin = Skin(carrier, vertices, at)
         self.share = field_of(share)
         self.count, self.vertices = len(tetrahedra), len(vertices)
         self.serial = is_too_small(self.count, PARALLEL_FROM)

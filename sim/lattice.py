@@ -12,8 +12,10 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
+from sim.fields import fields_of
 from sim.sampling import SamplingError, check_memory
 from sim.signed_distance import signed_distance
+from sim.skinning import NodeCarrier
 from sim.stored_arrays import stored
 
 # Corners of a cell, x slowest.
@@ -64,7 +66,23 @@ class Lattice:
         """Mass (n,) of each node for a density (m,) of each cell, in the density's unit of mass for 1 mm^3."""
         return np.bincount(self.cells.ravel(), (density[:, None] * self.tissue).ravel(), len(self.nodes))
 
-    def interpolation(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    @property
+    def interpolation(self) -> "CellInterpolation":
+        """Between the nodes, for points of the tissue."""
+        return CellInterpolation(self.nodes, self.cells, self.cell_mm, self.low_mm, self.index_of)
+
+
+@dataclass(frozen=True)
+class CellInterpolation:
+    """Points between the nodes of a lattice: the arrays of ``Lattice`` that it takes."""
+
+    nodes: np.ndarray
+    cells: np.ndarray
+    cell_mm: float
+    low_mm: np.ndarray
+    index_of: np.ndarray
+
+    def attach(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nodes (k, 8) and trilinear weights (k, 8), which sum to 1, of points (k, 3) [mm].
 
         Points outside all cells are extrapolated linearly from the nearest cell, for one width of a cell at most.
@@ -72,9 +90,13 @@ class Lattice:
         cell, inside = places_in_cells(points, self.cell_mm, self.low_mm, self.index_of)
         return self.cells[cell], shape_functions(inside)
 
+    def carrier(self) -> NodeCarrier:
+        """As ``Interpolation.carrier``."""
+        return NodeCarrier(self, *fields_of(self.nodes, self.nodes, within=1))
+
     def carried(self, points: np.ndarray, position: np.ndarray) -> np.ndarray:
         """Where points (k, 3) [mm] at rest are for positions (n, 3) [mm] of the nodes."""
-        return points + self.displacement(self.interpolation(points), position)
+        return points + self.displacement(self.attach(points), position)
 
     def displacement(self, at: tuple[np.ndarray, np.ndarray], position: np.ndarray) -> np.ndarray:
         """Displacement (k, 3) [mm] at places with these nodes and weights (k, 8), for positions (n, 3) [mm] of the nodes."""

@@ -27,6 +27,7 @@ from sim.linear_algebra import cross, four, row, solve
 from sim.material import Material, mixture
 from sim.removed_tissue import RemovedTissue, lattice_without, patch_shares, points_without
 from sim.rigid_correction import RigidCorrection
+from sim.skinning import NodeCarrier
 from sim.solver import StepSettings
 from sim.stored_arrays import stored
 from sim.surface_contact import PENALTY_DEPTH_MM, REACH_MM, SurfaceContacts
@@ -119,6 +120,7 @@ class NeoHookean:
         starts = [int(v) for v in lattice.colour_start]
         self.body = body
         self.lattice = self.whole_lattice = lattice
+        self.carrier = NodeCarrier(lattice.interpolation, body.position, body.rest)
         self.contacts: Any = contacts
         self.has_contacts = contacts is not None
         self.colours = tuple(pairwise(starts))
@@ -221,6 +223,7 @@ class NeoHookean:
         """
         whole = self.whole_lattice
         self.lattice = whole if tissue is None else lattice_without(whole, tissue, parts)
+        self.carrier.interpolation = self.lattice.interpolation
         density = mixture(self.material, self.parts, self.lattice.share)[2]
         fill((self.mass, self.lattice.node_mass(density) + self.load_g))
         if self.has_parts:
@@ -431,18 +434,6 @@ class NeoHookean:
 
     def update_frames(self) -> None:
         """Nothing to do: points are interpolated from the nodes."""
-
-    def attach(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes (n, 8) around points (n, 3) [mm], and their trilinear weights (n, 8)."""
-        return self.lattice.interpolation(points)
-
-    @ti.func
-    def carried(self, point, frame, weight):
-        """The current position of a point at rest [mm], by the weighted displacements of its nodes."""
-        x = point
-        for k in ti.static(range(frame.n)):
-            x += weight[k] * (self.body.position[frame[k]] - self.body.rest[frame[k]])
-        return x
 
 
 def place_of(a: int, b: int) -> int:

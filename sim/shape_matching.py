@@ -10,7 +10,6 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 import trimesh
-from scipy.spatial import cKDTree
 
 from sim.body import ParticleBody
 from sim.device import is_too_small
@@ -19,13 +18,10 @@ from sim.kernels import function, kernel
 from sim.linear_algebra import four, rotation_near, row
 from sim.particle_contact import REACH_RADII, ShapeContacts
 from sim.sampling import Patches, RestBody, fill_body, group_into_patches
+from sim.skinning import ClusterCarrier, ClusterInterpolation
 from sim.tissue_model import ModelInputs
 
 RELAXATIONS = ("local", "global")
-# A point is interpolated from this many clusters at most.
-MOST_FRAMES = 4
-# Keeps the weight of a point at a cluster's origin finite.
-LEAST_SQUARED_MM2 = 1e-6
 # With fewer particles, starting threads takes a CPU longer than they save.
 PARALLEL_PARTICLES = 100_000
 
@@ -82,6 +78,7 @@ class ShapeMatching:
         self.relaxation = relaxation
         self._allocate(patches)
         self._store_rest(patches)
+        self.carrier = ClusterCarrier(ClusterInterpolation(self.rest_centres), self.frame)
         self.update_frames()
 
     def _allocate(self, patches: Patches) -> None:
@@ -323,7 +320,7 @@ class ShapeMatching:
 
     @kernel
     def update_frames(self):
-        """Fit the frames to the current positions, for ``carried``, independently of earlier frames."""
+        """Fit the frames to the current positions, for the carrier, independently of earlier frames."""
         if ti.static(self.serial):
             ti.loop_config(serialize=True)
             for _ in range(1):
@@ -335,27 +332,6 @@ class ShapeMatching:
     def refit(self):
         self.sum_patches()
         self.fit(True)
-
-    def attach(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The up to four nearest clusters of points (n, 3) [mm], and their weights (Kavan 2014).
-
-        Weights are proportional to the inverse squared distance from the cluster's origin, and sum to 1.
-        """
-        frames = min(MOST_FRAMES, self.count)
-        distance, nearest = cKDTree(self.rest_centres).query(points, list(range(1, frames + 1)))
-        weight = 1.0 / (distance**2 + LEAST_SQUARED_MM2)
-        return nearest, weight / weight.sum(axis=1, keepdims=True)
-
-    @ti.func
-    def carried(self, point, frame, weight):
-        """The current position of a point at rest [mm], by its weighted frames (weighted matrix blending)."""
-        x = tm.vec4(0.0)
-        for k in ti.static(range(frame.n)):
-            moved = self.frame[frame[k]]
-            for axis in ti.static(range(3)):
-                x += weight[k] * point[axis] * row(moved, axis)
-            x += weight[k] * row(moved, 3)
-        return x.xyz
 
 
 def fill_organ(organ: trimesh.Trimesh, tissue: Any) -> RestBody:

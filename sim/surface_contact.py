@@ -76,7 +76,7 @@ class SurfaceContacts:
 
     def _interpolation(self, lattice: Lattice, points: np.ndarray) -> tuple[np.ndarray, ...]:
         """Nodes and weights (p, 8) of points; and by node: the first entry (n + 1,), the points and their weights (8 p,)."""
-        nodes, weights = lattice.interpolation(points)
+        nodes, weights = lattice.interpolation.attach(points)
         offsets = np.arange(0, nodes.size + 1, nodes.shape[1])
         of_nodes = csr_array(
             (weights.ravel(), nodes.ravel(), offsets), shape=(len(nodes), self.body.count)

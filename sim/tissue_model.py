@@ -7,13 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
-import numpy as np
-import taichi as ti
-
 from sim.attachment import FixedRegion, Tether
 from sim.body import Body
 from sim.material import Part
 from sim.particle_contact import ShapeContacts
+from sim.skinning import Carrier
 from sim.surface_contact import SurfaceContacts
 
 
@@ -39,11 +37,11 @@ class ModelInputs:
 
 
 class TissueModel(Protocol):
-    """Rest state, projection of the constraints on the predicted positions, and interpolation of points in the tissue.
+    """Rest state, projection of the constraints on the predicted positions, and what carries points of the tissue along.
 
     ``serial``: the model is too small for more than one core of a CPU. ``EMBEDDING_CELL_RATIO``: width of the coarse tetrahedra
     that carry the image plane, over the resolution of the tissue. ``begin`` to ``project`` are ti.funcs that the solver's
-    kernels inline, so their outermost loops are parallel; ``carried`` is one for a single point. A model whose material can be
+    kernels inline, so their outermost loops are parallel. A model whose material can be
     changed between steps also has ``set_material(young_kpa)``. One that carries more than the body from step to step has ``history``, these
     fields by name, which its ti.func ``finish(dt)`` updates at the end of each substep.
     """
@@ -81,16 +79,13 @@ class TissueModel(Protocol):
     def project(self, stiffness: float, relaxation_factor: float, dt: float) -> None:
         """One iteration over all constraints, contacts with shapes included."""
 
+    @property
+    def carrier(self) -> Carrier:
+        """What carries points of the tissue along, of the model's own fields."""
+        ...
+
     def update_frames(self) -> None:
-        """Prepare ``carried``. Called once a step, when positions are final."""
-
-    def attach(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Frames (n, k) and weights (n, k) of rest points (n, 3) [mm], for ``carried``."""
-        ...
-
-    def carried(self, point: ti.Vector, frame: ti.Vector, weight: ti.Vector) -> ti.Vector:
-        """Return the current position (3,) [mm] of an attached point, from its rest position, frames (k,) and weights (k,)."""
-        ...
+        """Prepare the carrier. Called once a step, when positions are final."""
 
     def counts(self) -> dict[str, int]:
         """Sizes of the model, for reports: ``particles`` or ``nodes`` first."""

@@ -39,7 +39,7 @@ class ResectionView:
         self._plan_skin: Skin | None = None
         if plan is not None:
             line = np.array(plan.best.line_mm) - rehearsal.origin
-            self._plan_skin = Skin(rehearsal.model, line)
+            self._plan_skin = Skin(rehearsal.model.carrier, line)
         self.fault = ""
         self.tumour_mm = np.zeros(0)
         self.seen_share = 1.0

@@ -61,8 +61,8 @@ class BeadExperiment:
             rest or _organ(case), tissue, shapes, tool, contact, fixed=fixed, parts=parts
         )
         self.body, self.model = self.solver.body, self.solver.model
-        self.parts = [(Skin(self.model, part.surface.vertices), part.surface.faces) for part in parts]
-        self.beads = Skin(self.model, case.beads - self.origin)
+        self.parts = [(Skin(self.model.carrier, part.surface.vertices), part.surface.faces) for part in parts]
+        self.beads = Skin(self.model.carrier, case.beads - self.origin)
 
     def run(self, setup: Setup) -> BeadRun:
         """Press the organ from its stress-free shape.

@@ -76,12 +76,12 @@ class Cantilever:
         lattice = fill_block(tuple(counts), cell_mm)
         self.cell_mm = cell_mm
         self.feet = np.clip(self.markers, 0.0, size)
-        self.frame, self.weight = lattice.interpolation(self.feet)
+        self.frame, self.weight = lattice.interpolation.attach(self.feet)
         self.end = lattice.nodes[:, 2] > size[2] - 1.01 * cell_mm
         along = np.linspace(0, size[1], 31)
         height = size[0] if hung_mm is None else hung_mm
         line = np.column_stack([np.full(31, height), along, np.full(31, size[2])])
-        node, share = lattice.interpolation(line)
+        node, share = lattice.interpolation.attach(line)
         load = np.bincount(node.ravel(), load_g / len(line) * share.ravel(), len(lattice.nodes))
         fixed = lattice.nodes[:, 2] < 1e-6 * size[2]
         self.body = Body(lattice.nodes)

@@ -272,7 +272,7 @@ def _images(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[str,
     cell = embedding_cell_mm(rehearsal.scene.tissue)
     for name, outside, mode, detail_level in levels:
         margin = SURROUNDINGS_MM if shows_ct(outside) else 0.0
-        embedding = Embedding(rehearsal.model, rehearsal.organ, cell, margin)
+        embedding = Embedding(rehearsal.model.carrier, rehearsal.organ, cell, margin)
         scanner = Scanner(scanned, embedding, probe, image.pixels, outside)
 
         def draw() -> None:

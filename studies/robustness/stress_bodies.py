@@ -97,7 +97,7 @@ def prepared(model: str, subject: Subject) -> Specimen:
         solver, settings = _block(model, 1 if subject.kind == "one" else 2, shapes, tool)
     else:
         solver, settings = _filled(model, subject, mesh, shapes, tool)
-    skin = Skin(solver.model, mesh.vertices)
+    skin = Skin(solver.model.carrier, mesh.vertices)
     settings.gravity = DOWN
     _settle(solver, settings, tool)
     skin.update()

@@ -130,7 +130,7 @@ def test_a_pixel_shows_the_tissue_that_is_there_now(kept):
     local = (pixels[:, ::-1] + 0.5) * spacing - [plane.width_mm / 2, 0]
     shown_at = np.column_stack([local, np.zeros(len(local)), np.ones(len(local))]) @ plane.world_from_plane.T
     rest = rehearsal.scanner.plane.rest_grid(rehearsal.scene.image.pixels)[pixels[:, 0], pixels[:, 1]]
-    carried = array_of(Skin(rehearsal.model, rest).vertices)
+    carried = array_of(Skin(rehearsal.model.carrier, rest).vertices)
     off = np.linalg.norm(carried - shown_at[:, :3], axis=1)
     unmoved = np.linalg.norm(rest - shown_at[:, :3], axis=1)
     assert len(off) > 50 and unmoved.mean() > 2.0
@@ -218,7 +218,7 @@ def test_the_outline_is_the_tumours_border_not_what_is_drawn_of_it(kept):
     outline = rehearsal.tumour_outline()
     plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], 1.0, 1.0)
     flat = np.column_stack([outline.reshape(-1, 2), np.zeros(2 * len(outline)), np.ones(2 * len(outline))])
-    carried = array_of(Skin(rehearsal.model, rehearsal.tumour.vertices).vertices)
+    carried = array_of(Skin(rehearsal.model.carrier, rehearsal.tumour.vertices).vertices)
     border = trimesh.Trimesh(carried, rehearsal.tumour.faces, process=False)
     away = signed_distance(border.vertices, border.faces, (flat @ plane.world_from_plane.T)[:, :3])[0]
     assert len(outline) > 20 and np.abs(away).max() < 1e-3

@@ -164,7 +164,7 @@ def test_a_hanging_block_stretches_as_tissue_and_capsule_side_by_side(one_device
     for _ in range(500):
         solver.step(settings_of(20, gravity=(0, 0, -gravity)))
     moved = (position(solver) - lattice.nodes)[:, 2]
-    low = lattice.interpolation(np.array([[0.0, 0.0, -length / 2]]))
+    low = lattice.interpolation.attach(np.array([[0.0, 0.0, -length / 2]]))
     sag = -float(low[1][0] @ moved[low[0][0]])
     tissue, capsule = 1e3 * young * side**2, N_MM * stiffness_n_mm * 4 * side
     load = DENSITY * gravity * side**2 * (length - 2.0) ** 2 / 2

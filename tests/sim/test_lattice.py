@@ -140,7 +140,7 @@ def test_interpolation_is_exact_for_linear_fields_inside(mesh):
     lattice = fill_with_cells(mesh, 3.0)
     points = np.random.default_rng(3).uniform(*mesh.bounds, (2000, 3))
     points = np.concatenate([points[signed(mesh, points) < 0], mesh.vertices])
-    nodes, weights = lattice.interpolation(points)
+    nodes, weights = lattice.interpolation.attach(points)
     assert np.abs(weights.sum(axis=1) - 1).max() < 1e-13
     carried = np.einsum("pk,pkd->pd", weights, (lattice.nodes @ F.T + OFFSET)[nodes])
     assert np.abs(carried - points @ F.T - OFFSET).max() < 1e-12
@@ -149,7 +149,7 @@ def test_interpolation_is_exact_for_linear_fields_inside(mesh):
 def test_points_outside_all_cells_move_with_the_nearest_cell(ball):
     lattice = fill_with_cells(ball, 3.0)
     points = np.random.default_rng(6).uniform(-16, 16, (500, 3))
-    nodes, _ = lattice.interpolation(points)
+    nodes, _ = lattice.interpolation.attach(points)
     low, high = (lattice.nodes[lattice.cells].min(axis=1), lattice.nodes[lattice.cells].max(axis=1))
     apart = np.linalg.norm(points[:, None] - (low + high) / 2, axis=2)
     inside = ((points[:, None] >= low) & (points[:, None] <= high)).all(axis=2)
@@ -165,7 +165,7 @@ def test_extrapolation_ends_after_a_cell(ball):
     linear = lattice.nodes @ F.T + OFFSET
     for distance, exact in ((1.0, True), (200.0, False)):
         points = (12.0 + distance) * direction
-        nodes, weights = lattice.interpolation(points)
+        nodes, weights = lattice.interpolation.attach(points)
         assert np.abs(weights.sum(axis=1) - 1).max() < 1e-12
         # Trilinear weights at a place of -1 to 2 are products of three of at most 2.
         assert np.abs(weights).max() <= (1 + EXTRAPOLATED_CELLS) ** 3 + 1e-12

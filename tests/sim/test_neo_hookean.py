@@ -335,7 +335,7 @@ def sag(poisson: float, cell: float, iterations: int, side: float = 8.0, span: f
     # Inertia is negligible over ten seconds, so this is one static solve.
     solver.step(settings_of(iterations, (0, 0, -gravity), time_step_s=10.0, relaxation_factor=1.95))
     lattice = solver.model.lattice
-    nodes, weights = lattice.interpolation(np.array([[span, 0.0, 0.0]]))
+    nodes, weights = lattice.interpolation.attach(np.array([[span, 0.0, 0.0]]))
     tip = weights[0] @ (position(solver) - lattice.nodes)[nodes[0]]
     load, young = DENSITY * gravity * side**2, 1e3 * YOUNG_KPA
     shear_factor = 10 * (1 + poisson) / (12 + 11 * poisson)

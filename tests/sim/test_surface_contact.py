@@ -250,7 +250,7 @@ def beads(solver, x: np.ndarray) -> np.ndarray:
     """Where the same points inside the dome are, whatever the cells, when the nodes are at x."""
     points = np.random.default_rng(0).uniform(-11, 11, (800, 3))
     points = points[(np.linalg.norm(points, axis=1) < 11) & (points[:, 2] > -5.5)]
-    nodes, weights = solver.model.lattice.interpolation(points)
+    nodes, weights = solver.model.lattice.interpolation.attach(points)
     return np.einsum("pk,pkd->pd", weights, x[nodes])
 
 

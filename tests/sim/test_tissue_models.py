@@ -95,7 +95,7 @@ def ball_of(model: str, on_table: bool, serial: bool | None = None) -> Subject:
     floor = Plane(np.array([0.0, 0.0, 1.0]), -RADIUS_MM)
     shapes, led = ([floor, tool], tool) if on_table else ([], None)
     solver = build_solver(mesh, tissue_of(model), shapes, led, serial=serial)
-    return Subject(model, mesh, solver, Skin(solver.model, mesh.vertices), solver.snapshot())
+    return Subject(model, mesh, solver, Skin(solver.model.carrier, mesh.vertices), solver.snapshot())
 
 
 @pytest.fixture(scope="module", params=TISSUES)
@@ -206,7 +206,7 @@ def test_attached_points_move_with_the_body(free):
     # At 60 mm float32 is off by 4e-6 mm, over some ten operations.
     assert np.abs(free.surface() - (free.mesh.vertices @ turn.T + way)).max() < 1e-4
     # So is what carries the image plane; elements move what is beside them as the nearest point of the surface, without turning it.
-    embedding = Embedding(free.solver.model, free.mesh, embedding_cell_mm(free.tissue))
+    embedding = Embedding(free.solver.model.carrier, free.mesh, embedding_cell_mm(free.tissue))
     embedding.update()
     rest, at = array_of(embedding.skin.rest), embedding.skin.at
     surface = free.mesh.vertices.view(np.ndarray), free.mesh.faces.view(np.ndarray)
@@ -218,7 +218,7 @@ def test_attached_points_move_with_the_body(free):
 
 
 def test_a_press_does_not_fold_the_surroundings(laid):
-    embedding = Embedding(laid.solver.model, laid.mesh, embedding_cell_mm(laid.tissue), margin_mm=25.0)
+    embedding = Embedding(laid.solver.model.carrier, laid.mesh, embedding_cell_mm(laid.tissue), margin_mm=25.0)
     laid.press(laid.settings(G), 18.0, 13.0, 12)
     embedding.update()
     first, *others = array_of(embedding.skin.vertices)[array_of(embedding.tetrahedron)].transpose(1, 0, 2)

@@ -571,7 +571,7 @@ def moved(taichi):
     """A tank whose tissue a ball of 12 mm carries along, and what moves it: x -> matrix @ x + shift."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=12.0)
     model = tissue_of(ball)
-    embedding = Embedding(model, ball, 4.0)
+    embedding = Embedding(model.carrier, ball, 4.0)
 
     def move(matrix, shift) -> None:
         x = (model.body.rest_points @ np.transpose(matrix) + shift).astype(np.float32)

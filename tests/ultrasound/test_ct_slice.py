@@ -96,7 +96,7 @@ class Embedded:
 
 def embedded(mesh, margin_mm: float = 0.0) -> Embedded:
     model = tissue_of(mesh, RADIUS)
-    return Embedded(model, Embedding(model, mesh, 2 * RADIUS, margin_mm))
+    return Embedded(model, Embedding(model.carrier, mesh, 2 * RADIUS, margin_mm))
 
 
 def cut_of(embedding: Embedding | Unmoved, mesh, image: Callable, pixels: int, outside: str) -> Scanner:
@@ -374,7 +374,7 @@ def test_tetrahedra_fill_the_organ_without_gaps(ball):
 
 def test_skin_weights_fall_off_with_the_inverse_square(kept, ball):
     model = kept(embedded, ball).model
-    skin = Skin(model, ball.vertices)
+    skin = Skin(model.carrier, ball.vertices)
     frame, weight = array_of(skin.frame), array_of(skin.weight)
     assert frame.shape[1] == 4
     assert weight.sum(axis=1) == pytest.approx(np.ones(len(weight)), abs=1e-6)

@@ -135,7 +135,7 @@ def test_tissue_that_turns_turns_its_flow(vessel):
     """Blood that flows to the left at rest, in tissue that is turned by 40 degrees."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=12.0)
     model = tissue_of(ball)
-    embedding = Embedding(model, ball, 4.0)
+    embedding = Embedding(model.carrier, ball, 4.0)
     turn = rotation_about([0, 0, 1], 40.0)
     x = (model.body.rest_points @ turn.T).astype(np.float32)
     model.body.restore(BodyState(x, np.zeros_like(x)))
