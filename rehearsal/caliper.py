@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from rehearsal.cine import CineFrame
-from rehearsal.inputs.user_input import STILL_MM
+from rehearsal.sources.user import STILL_MM
 from render.viewer import View
 
 

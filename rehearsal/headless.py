@@ -1,24 +1,33 @@
 """A rehearsal without a screen: the scripted press, or a recorded session."""
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import click
 from PIL import Image
 
-from rehearsal.frame import Frames
+from rehearsal.deformed_anatomy import DeformedAnatomy
+from rehearsal.drawn_geometry import drawn_geometry, open_viewer
 from rehearsal.image_and_surface_files import save_image_file, save_surfaces
+from rehearsal.imaging import image_view
+from rehearsal.loop.command import SetValues
+from rehearsal.loop.observer import Observer, Source
 from rehearsal.measurements.live_measurements import LiveMeasurements
-from rehearsal.measurements.run_report import summary
+from rehearsal.measurements.run_report import Tally, summary
 from rehearsal.notices import Notices
-from rehearsal.open_window import geometry_of, open_viewer, probe_with_settings
 from rehearsal.rehearsal import Rehearsal
+from rehearsal.resection.resection_plan import ResectionPlan
+from rehearsal.resection.resection_view import ResectionView, cut_settings
 from rehearsal.result_files import write_json
+from rehearsal.settings import probe_with_settings, set_settings
+from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer, send_live
 from render.animation import ANIMATION_FPS, empty_folder, save_animation, scaled_down, side_by_side
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan, Window
 from scenes.atomic_files import atomic_write
 from scenes.terminal import bar
+from ultrasound.probe import Probe
 
 # An animation is held in memory: a long session has fewer images in it.
 MOST_SHOWN = 240
@@ -28,15 +37,15 @@ ANIMATION = "press.webp"
 class Pictures:
     """The images of a run: frames, slices and an animation in a folder."""
 
-    def __init__(self, rehearsal: Rehearsal, steps: int, out: Path) -> None:
+    def __init__(self, anatomy: DeformedAnatomy, steps: int, out: Path) -> None:
         self.steps, self.out = steps, out
-        self._rehearsal, self._shown_version = rehearsal, rehearsal.geometry_version
+        self._anatomy, self._version = anatomy, anatomy.geometry.version
         self.viewer: Window | None = None
         try:
-            self.viewer = open_viewer(rehearsal, visible=False)
+            self.viewer = open_viewer(anatomy, visible=False)
         except NoVulkan as reason:
             click.echo(f"{reason}; writing the pictures and the report without 3D frames.")
-        self._every = max(1, round(1 / (ANIMATION_FPS * rehearsal.settings.time_step_s)))
+        self._every = max(1, round(1 / (ANIMATION_FPS * anatomy.case.scene.solver.time_step_s)))
         self._shown_every = self._every * (1 + steps // self._every // MOST_SHOWN)
         folders = out / "frames", out / "slices"
         if any(next(folder.glob("*.png"), None) for folder in folders):
@@ -51,9 +60,9 @@ class Pictures:
         picture = side_by_side(view)
         save_image_file(picture, self._slices / f"{step:05d}.png")
         if self.viewer is not None:
-            if self._rehearsal.geometry_version != self._shown_version:
-                self._shown_version = self._rehearsal.geometry_version
-                self.viewer.change_geometry(geometry_of(self._rehearsal))
+            if self._anatomy.geometry.version != self._version:
+                self._version = self._anatomy.geometry.version
+                self.viewer.change_geometry(drawn_geometry(self._anatomy))
             self.viewer.draw(measurements.onto(view, settings))
             picture = Image.fromarray(self.viewer.picture())
             save_image_file(picture, self._frames / f"{step:05d}.png")
@@ -67,45 +76,75 @@ class Pictures:
         return f"{-(-self.steps // self._every)} pictures, {ANIMATION}"
 
 
+@dataclass
+class HeadlessLoop:
+    """A rehearsal without a window: each time around one step, and where it ``draws``, an image of it, also for the link."""
+
+    rehearsal: Rehearsal
+    source: Source
+    measurements: LiveMeasurements
+    observers: list[Observer]
+    settings: Settings
+    tally: Tally
+    notices: Notices
+    resection: ResectionView
+    link: OpenIGTLinkServer | None = None
+    warnings: tuple[str, ...] = ()
+    """Of the import, which nobody has acknowledged."""
+
+    def run(self, steps: int, out: Path, draws: bool) -> list[str]:
+        """Make so many steps; return what was written of images."""
+        anatomy = self.rehearsal.anatomy
+        pictures = Pictures(anatomy, steps, out) if draws else None
+        step_s, controls = anatomy.case.scene.solver.time_step_s, Controls(self.settings)
+        for step in bar(range(1, steps + 1), "press"):
+            for command in self.source.commands(self.rehearsal.frame, controls, step_s):
+                if isinstance(command, SetValues):
+                    set_settings(self.settings, command.values)
+                self.rehearsal.stepper.submit(command)
+            frame = self.rehearsal.do()
+            probe = probe_with_settings(anatomy.case.probe, self.settings)
+            view = self._view(probe) if draws else anatomy.find_plane(probe)
+            self.tally.add(self.rehearsal, frame)
+            for observer in self.observers:
+                observer.observe(frame, probe)
+            if pictures is not None and view is not None:
+                send_live(self.link, anatomy, view, probe)
+                pictures.draw(step, view, self.settings, self.measurements)
+            self.notices.present()
+        return [pictures.save()] if pictures is not None else []
+
+    def _view(self, probe: Probe) -> View:
+        """The images of the present frame, with the score and the coming cut."""
+        view = image_view(self.rehearsal.anatomy, probe, self.settings, self.tally.slice_ms)
+        view = replace(view, warnings=tuple(f"Import: {text}" for text in self.warnings))
+        planned = cut_settings(self.settings)
+        self.resection.update(planned, lambda points: self.measurements.coverage.is_seen(points))
+        score = self.resection.score(planned.margin_mm)
+        return view if score is None else replace(view, score=score, resection_mm=self.resection.section())
+
+
 def run_headless(
-    frames: Frames,
-    notices: Notices,
+    loop: HeadlessLoop,
     steps: int,
-    settings: Settings,
     arch: str,
     out: Path,
     draws: bool = True,
+    plan: ResectionPlan | None = None,
     about: dict[str, Any] | None = None,
 ) -> None:
-    """Compute so many frames; write surfaces and report.json, and where it ``draws``, images too, also for the link.
+    """Compute so many steps; write surfaces and report.json, and where it ``draws``, images too.
 
     ``about`` is what else the report says, of the patient.
     """
-    rehearsal, tally = frames.rehearsal, frames.tally
-    pictures = Pictures(rehearsal, steps, out) if draws else None
-    for step in bar(range(1, steps + 1), "press"):
-        pose = frames.input(Controls(settings))
-        frames.step(pose)
-        probe = probe_with_settings(rehearsal.probe, settings)
-        if pictures is None:
-            rehearsal.find_plane(probe)
-        else:
-            view = frames.image(probe, settings)
-        if pose is not None:
-            # After a rollback the tissue is restored, but the tool only with the next step.
-            tally.watch(rehearsal)
-        frames.observe(probe, pose)
-        if pictures is not None:
-            frames.send(view, probe)
-            pictures.draw(step, view, settings, frames.measurements)
-        notices.present()
-    save_surfaces(rehearsal, out)
-    drawn = [pictures.save()] if pictures is not None else []
-    report = tally.report(rehearsal, arch) | (about or {}) | dict(reading=frames.measurements.figures())
-    if rehearsal.judgement is not None:
+    rehearsal = loop.rehearsal
+    drawn = loop.run(steps, out, draws)
+    save_surfaces(rehearsal.anatomy, out)
+    report = loop.tally.report(rehearsal, arch) | (about or {}) | dict(reading=loop.measurements.figures())
+    if rehearsal.anatomy.judgement is not None:
         from rehearsal.resection.resection_page import report_of
 
-        report |= dict(resection=report_of(rehearsal, frames.resection_plan))
+        report |= dict(resection=report_of(rehearsal.anatomy, plan))
     write_json(report, out / "report.json")
     click.echo(summary(report))
     click.echo(f"Wrote {' and '.join([*drawn, 'report.json'])} to {out}")

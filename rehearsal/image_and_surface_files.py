@@ -1,6 +1,7 @@
 """Files of images (PNG; B-mode as DICOM too) and surfaces (PLY) from a rehearsal or a scan."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,14 +10,14 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from rehearsal.rehearsal import Rehearsal
+from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.resection.score_file import save_score
+from rehearsal.resection.score_line import LEAST_MARKS, ResectionError, score_line
 from rehearsal.result_files import next_number
 from render.animation import with_square_pixels
 from render.viewer import View
 from scenes.atomic_files import atomic_write
 from scenes.surfaces import save_surface
-from sim.fields import array_of
 from ultrasound.probe import Probe
 from ultrasound.scanner import B_MODE, DOPPLER
 
@@ -80,21 +81,24 @@ def save_view(view: View, probe: Probe, out: Path) -> str:
     return f"{prefix.name}-"
 
 
-def save_surfaces(rehearsal: Rehearsal, out: Path, prefix: str = "") -> None:
+def save_surfaces(anatomy: DeformedAnatomy, out: Path, prefix: str = "") -> None:
     """Write organ, tumour, and a specimen as it was cut (PLY, mm, LPS), and the score in the CT, and print the paths.
 
     Vertices are in the order of the rest surfaces.
     """
-    deformed = {"organ": (rehearsal.organ, array_of(rehearsal.organ_skin.vertices))}
-    if rehearsal.tumour is not None:
-        deformed["tumour"] = rehearsal.tumour, rehearsal.tumour_vertices()
-    if rehearsal.cut is not None:
-        specimen = rehearsal.cut.specimen
-        deformed["specimen"] = specimen, rehearsal.carried_then(specimen.vertices)
-    score = save_score(rehearsal, out, prefix)
-    if score is not None:
-        click.echo(f"Saved {score}")
+    deformed = {"organ": (anatomy.organ, anatomy.vertices)}
+    if anatomy.tumour is not None:
+        deformed["tumour"] = anatomy.tumour, anatomy.tumour_vertices
+    if anatomy.cut is not None:
+        specimen = anatomy.cut.specimen
+        deformed["specimen"] = specimen, anatomy.carried_then(specimen.vertices)
+    marks = anatomy.frame.resection.points()
+    # A line that cannot be drawn was refused in words already.
+    with suppress(ResectionError):
+        if len(marks) >= LEAST_MARKS:
+            line = score_line(anatomy.case.organ, marks)
+            click.echo(f"Saved {save_score(anatomy.case, line, out, prefix)}")
     for name, (rest, vertices) in deformed.items():
         path = out / f"{prefix}{name}.ply"
-        save_surface(trimesh.Trimesh(vertices + rehearsal.origin, rest.faces, process=False), path)
+        save_surface(trimesh.Trimesh(vertices + anatomy.case.origin, rest.faces, process=False), path)
         click.echo(f"Saved {path}")

@@ -11,6 +11,7 @@ import click
 import numpy as np
 
 from rehearsal.asked_files import AskedFiles, check_anatomy, read_files
+from rehearsal.case import Case, case_of
 from rehearsal.commands.command_line import CommandError, make_folder, start_taichi
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.configuration import Setup, scene_of
@@ -25,12 +26,12 @@ from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.import_findings import warning_lines
 from scenes.scene import Scene
 from scenes.terminal import ReportProgress, stages
-from ultrasound.probe import Probe
 
 if TYPE_CHECKING:
+    from rehearsal.deformed_anatomy import DeformedAnatomy
     from rehearsal.real_time.solver_process import SolverProcess
     from rehearsal.rehearsal import Rehearsal
-    from rehearsal.run import RehearsalRun
+    from rehearsal.run import Built, RehearsalRun
     from render.viewer import View
     from render.window import Window
 
@@ -77,15 +78,15 @@ def opened(asked: RehearseOptions, process: StartedProcess | None) -> Iterator["
                     viewer = resources.enter_context(window(asked, files.keys))
             # A session of this backend is replayed as it was recorded, on however many cores.
             serial = files.log.header.serial if files.log and files.log.header.arch == arch else None
-            given = asked, scene, anatomy, files.probe, serial
+            case = case_of(scene, anatomy, files.probe)
             if solver is None or viewer is None:
-                rehearsal = built_headless(*given, progress)
+                built = built_headless(asked, case, anatomy, serial, progress)
             else:
-                rehearsal = built_for_window(*given, arch, solver, viewer, progress)
+                built = built_for_window(asked, case, anatomy, serial, arch, solver, viewer, progress)
             build_s = perf_counter() - began
             if solver is None and not asked.no_pictures:
                 progress("Building the model: the first picture")
-                compile_picture(rehearsal)
+                compile_picture(built.anatomy)
         # All this lives as long as the rehearsal: to look for garbage in it would delay single frames by a tenth of a second.
         gc.freeze()
         # At the end Python must be able to delete it: Taichi writes its kernels to their cache only when it is deleted.
@@ -95,7 +96,7 @@ def opened(asked: RehearseOptions, process: StartedProcess | None) -> Iterator["
             click.echo(chosen)
         from rehearsal.run import RehearsalRun
 
-        yield RehearsalRun(rehearsal, anatomy, arch, asked, files, viewer, solver, link, build_s, start)
+        yield RehearsalRun(built, anatomy, arch, asked, files, viewer, link, build_s, start)
 
 
 @contextmanager
@@ -128,47 +129,57 @@ def window(asked: RehearseOptions, keys: Keys) -> Iterator["Window"]:
 
 def built_headless(
     asked: RehearseOptions,
-    scene: Scene,
+    case: Case,
     anatomy: LoadedAnatomy,
-    probe: Probe,
     serial: bool | None,
     progress: ReportProgress,
-) -> "Rehearsal":
-    """The rehearsal without a window."""
+) -> "Built":
+    """The rehearsal without a window: the solver is in this process."""
     from rehearsal.rehearsal import Rehearsal
+    from rehearsal.run import Built
 
-    needs_b_mode = scene.image.mode != "ct" and not asked.no_pictures
-    return Rehearsal(scene, anatomy, probe, progress, needs_b_mode, serial=serial)
+    needs_b_mode = case.scene.image.mode != "ct" and not asked.no_pictures
+    rehearsal = Rehearsal(case, anatomy, progress, needs_b_mode, serial)
+    model = rehearsal.organ.model
+    shown = rehearsal.anatomy, rehearsal.stepper, rehearsal.manipulator
+    return Built(*shown, model.counts(), model.serial, rehearsal)
 
 
 def built_for_window(
     asked: RehearseOptions,
-    scene: Scene,
+    case: Case,
     anatomy: LoadedAnatomy,
-    probe: Probe,
     serial: bool | None,
     arch: str,
     solver: "SolverProcess",
     viewer: "Window",
     progress: ReportProgress,
-) -> "Rehearsal":
+) -> "Built":
     """The rehearsal that a window shows. While the process of the solver brings the tissue to rest, this one prepares the first picture."""
-    from rehearsal.open_window import geometry_of, initial_settings
+    from rehearsal.deformed_anatomy import DeformedAnatomy, scanned_ct
+    from rehearsal.drawn_geometry import drawn_geometry
+    from rehearsal.loop.frame import at_rest
     from rehearsal.real_time.solver_loop import SolverSetup
-    from rehearsal.rehearsal import Rehearsal
+    from rehearsal.rehearsal import begin
+    from rehearsal.run import Built
+    from rehearsal.settings import initial_settings
 
-    time_step_s = scene.solver.time_step_s if asked.rate is None else 1.0 / asked.rate
+    time_step_s = case.scene.solver.time_step_s if asked.rate is None else 1.0 / asked.rate
     pace = Pace(time_step_s, asked.budget_ms or np.inf)
-    solver.build(SolverSetup(scene, anatomy, probe, arch, pace, serial))
-    needs_b_mode = scene.image.mode != "ct"
-    rehearsal = Rehearsal(scene, anatomy, probe, progress, needs_b_mode, settles=False, serial=serial)
+    solver.build(SolverSetup(case, arch, pace, serial))
+    scanned = scanned_ct(case, anatomy, case.scene.image.mode != "ct")
+    progress("Building the model: tissue and contacts")
+    model = solver.model()
+    progress("Building the model: surfaces")
+    shown = DeformedAnatomy(case, anatomy, model.interpolation, scanned)
+    shown.show(at_rest(case, model.interpolation))
     progress("Building the model: the first picture")
-    viewer.show_scene(geometry_of(rehearsal), initial_settings(rehearsal))
-    viewer.prepare(compile_picture(rehearsal))
+    viewer.show_scene(drawn_geometry(shown), initial_settings(case))
+    viewer.prepare(compile_picture(shown))
     progress("Building the model: the tissue comes to rest")
-    rehearsal.take_settled(solver.settled())
-    solver.attach(rehearsal)
-    return rehearsal
+    solver.begin()
+    manipulator = begin(case, shown, solver)
+    return Built(shown, solver, manipulator, model.counts, model.serial)
 
 
 def check_graphics() -> None:
@@ -186,13 +197,12 @@ def check_graphics() -> None:
         )
 
 
-def compile_picture(rehearsal: "Rehearsal") -> "View":
+def compile_picture(anatomy: "DeformedAnatomy") -> "View":
     """Compute one view in advance, so that the first frame need not wait for its kernels."""
-    from rehearsal.frame import image_view
-    from rehearsal.measurements.run_report import Tally
-    from rehearsal.open_window import initial_settings
+    from rehearsal.imaging import image_view
+    from rehearsal.settings import initial_settings
 
-    return image_view(rehearsal, rehearsal.probe, initial_settings(rehearsal), Tally(0.0))
+    return image_view(anatomy, anatomy.case.probe, initial_settings(anatomy.case))
 
 
 def scene_within_budget(
@@ -204,7 +214,7 @@ def scene_within_budget(
 
     def build(setup: Setup) -> "Rehearsal":
         start_taichi(arch)
-        return Rehearsal(scene_of(files.scene, setup), anatomy, files.probe, progress)
+        return Rehearsal(case_of(scene_of(files.scene, setup), anatomy, files.probe), anatomy, progress)
 
     front = front_of(load_points(), asked.model)
     _, point, step_ms = choose_within_budget(front, build, asked.budget_ms, asked.error_mm)

@@ -1,4 +1,4 @@
-"""A rehearsal from start to end: its input source, its recording, and its summary."""
+"""A rehearsal from start to end: its source, its observers, its recording, and its summary."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -10,33 +10,39 @@ import click
 import numpy as np
 from click.exceptions import Exit
 
+from rehearsal.announcements import Announcements
 from rehearsal.asked_files import AskedFiles
 from rehearsal.commands.command_line import STOPPED, CommandError
 from rehearsal.commands.rehearse_options import RehearseOptions
-from rehearsal.frame import Frames, WindowFrames
-from rehearsal.headless import run_headless
-from rehearsal.inputs.input_source import InputSource, ReplayInput, ScriptedInput
-from rehearsal.inputs.user_input import UserInput
+from rehearsal.deformed_anatomy import DeformedAnatomy
+from rehearsal.headless import HeadlessLoop, run_headless
+from rehearsal.loop.command import Checkpoint
+from rehearsal.loop.frame import Checkpointed, Frame
+from rehearsal.loop.observer import Observer, Source
+from rehearsal.loop.stepper import Stepper
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally
 from rehearsal.measurements.session_summary import summary_text
 from rehearsal.notices import Notices
-from rehearsal.open_window import initial_settings
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plans_in_window import PlanControl
-from rehearsal.real_time.solver_process import SolverProcess
+from rehearsal.real_time.solver_process import SolverEnded
 from rehearsal.real_time.start_times import StartTimes
-from rehearsal.rehearsal import Rehearsal, RehearsalState
+from rehearsal.rehearsal import Rehearsal, script_length_s, scripted_pose
+from rehearsal.resection.resection_view import ResectionView
 from rehearsal.resection.script import ResectionScript
-from rehearsal.sessions.open_session import open_session
-from rehearsal.sessions.recorder import SessionRecorder, record
-from rehearsal.sessions.replay import Replay
-from rehearsal.sessions.session import Session
+from rehearsal.sessions.packed_arrays import pack_seen
+from rehearsal.sessions.recorder import SessionRecorder, header_of, next_path
+from rehearsal.sessions.replay import Replay, ReplayCheck, open_session
 from rehearsal.sessions.session_file import Header, Log
+from rehearsal.settings import initial_settings
+from rehearsal.sources.scripted import ReplaySource, ScriptedPress
+from rehearsal.sources.tracker import Tracker, played_pose
+from rehearsal.sources.user import UserSource
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer
 from rehearsal.tracking.pose_file import TimedPoses
-from rehearsal.tracking.sweep_recording import SweepRecorder
-from rehearsal.tracking.tracked_probe import PoseSource, played_pose
+from rehearsal.window_loop import WindowLoop
+from rehearsal.window_panel import WindowPanel
 from render.viewer import Settings
 from render.window import Window
 from scenes.anatomy import LoadedAnatomy
@@ -44,186 +50,221 @@ from scenes.import_findings import open_warnings
 from scenes.scene import EMBEDDED, SceneError
 from scenes.terminal import shell_command
 from scenes.tumour_complexity import complexity
+from ultrasound.probe import Probe
+from ultrasound.probe_manipulator import ProbeManipulator
 from version import VERSION
+
+# How long the last state may take to come from the solver's process.
+LAST_STATE_S = 2.0
+
+
+@dataclass
+class Built:
+    """A case ready to be rehearsed: its stepper, what a frame shows of it, and what moves the transducer; ``counts`` and ``serial`` are
+    those of its tissue model. ``rehearsal`` is there where the steps are made in this process.
+    """
+
+    anatomy: DeformedAnatomy
+    stepper: Stepper
+    manipulator: ProbeManipulator
+    counts: dict[str, int]
+    serial: bool
+    rehearsal: Rehearsal | None = None
 
 
 @dataclass
 class RehearsalRun:
-    """One rehearsal, its anatomy, the backend's name, what the user asked for, and the files that were read for it.
+    """One rehearsal, its anatomy as loaded, the backend's name, what the user asked for, and the files that were read for it.
 
-    ``viewer`` is the window, if there is one, and ``solver`` makes its steps. ``build_s`` is the time that building took.
+    ``viewer`` is the window, if there is one. ``build_s`` is the time that building took.
     """
 
-    rehearsal: Rehearsal
-    anatomy: LoadedAnatomy
+    built: Built
+    loaded: LoadedAnatomy
     arch: str
     asked: RehearseOptions
     files: AskedFiles
     viewer: Window | None = None
-    solver: SolverProcess | None = None
     link: OpenIGTLinkServer | None = None
     build_s: float = 0.0
     start: StartTimes = field(default_factory=StartTimes)
-    recorder: SessionRecorder | None = field(default=None, init=False)
+    recording: "Recording | None" = field(default=None, init=False)
     notices: Notices = field(default_factory=Notices, init=False)
 
     def __post_init__(self) -> None:
-        guide = None if self.files.plan is None else PlanGuidance(self.rehearsal, self.files.plan)
-        self.measurements = LiveMeasurements(self.rehearsal, guide, self.files.bands)
+        self.anatomy, self.manipulator = self.built.anatomy, self.built.manipulator
+        plan = self.files.plan
+        guide = None if plan is None else PlanGuidance(self.anatomy.case, self.manipulator, plan)
+        self.measurements = LiveMeasurements(self.anatomy, self.manipulator, guide, self.files.bands)
+        self.resection = ResectionView(self.anatomy, self.files.resection_plan)
 
-    def in_window(self, prepare: Callable[[WindowFrames], None] = lambda frames: None) -> None:
-        """Run in a window that shows the scene, after a replay if there is one; ``prepare`` is called with its frames before the first.
+    def in_window(self, prepare: Callable[[WindowLoop], None] = lambda loop: None) -> None:
+        """Run in the window, after a replay if there is one; ``prepare`` is called with its loop before the first frame.
 
         Raises SessionError, SolverEnded.
         """
-        if self.solver is None or self.viewer is None:
-            raise ValueError("expected a window and the process of the solver")
-        viewer = self.viewer
-        replay = None if self.files.log is None else self._replay(self.files.log, viewer.settings)
-        source = self._user_input() if replay is None else self._replay_input(replay)
+        if self.viewer is None:
+            raise ValueError("expected a window")
+        viewer, log = self.viewer, self.files.log
+        check = None if log is None else ReplayCheck(log, self.notices)
+        source = self._user() if log is None else self._replay_in_window(log, viewer.settings, check)
         text = f"The window is open, {self.start.now_s:.0f} s after the start; {{help}} shows the keys, {{quit}} quits."
         click.echo(self.files.keys.worded(text))
-        frames = WindowFrames(
-            self.rehearsal,
+        announcements = Announcements(self.anatomy, self.notices)
+        plans = PlanControl(self.anatomy.case, self.loaded, self.measurements, self.asked.out, self.notices)
+        panel = WindowPanel(
+            self.anatomy,
             source,
             self.measurements,
-            Tally(0.0),
+            announcements,
+            self.resection,
+            plans,
+            self.notices,
+            self.asked.out,
+            self.files.keys,
+            self.built.counts,
             self.link,
-            solver=self.solver,
-            viewer=viewer,
-            out=self.asked.out,
-            notices=self.notices,
-            sweeping=SweepRecorder(self.rehearsal, self.notices),
-            plans=PlanControl(self.rehearsal, self.anatomy, self.measurements, self.asked.out, self.notices),
-            keys=self.files.keys,
-            resection_plan=self.files.resection_plan,
-            warnings=self.files.warnings,
-            folder=self.files.folder,
+            self.files.warnings,
+            self.files.folder,
         )
-        prepare(frames)
+        observers = self._observers(announcements, check)
+        loop = WindowLoop(
+            viewer, self.built.stepper, source, self.anatomy, self.measurements, observers, panel
+        )
+        prepare(loop)
         try:
-            with self._summarised(source, replay):
-                frames.run()
+            with self._summarised(check):
+                loop.run()
         finally:
-            frames.plans.stop()
-            frames.sweeping.end()
+            plans.stop()
+            panel.sweeping.end()
             self.notices.present(self.files.keys.worded)
 
     def headless(self) -> None:
         """Run the scripted press, a replay or recorded poses to their end. Raises CommandError, SessionError."""
-        settings = initial_settings(self.rehearsal)
-        replay = None if self.files.log is None else self._replay(self.files.log, settings)
-        source: InputSource
-        if replay is not None:
-            source, steps = self._replay_input(replay), self._replayed_steps(replay)
+        rehearsal, log = self.built.rehearsal, self.files.log
+        if rehearsal is None:
+            raise ValueError("expected the solver in this process")
+        settings, source = initial_settings(self.anatomy.case), None
+        check = None if log is None else ReplayCheck(log, self.notices)
+        if log is not None:
+            replay = Replay(log, one_by_one=True)
+            self._open(replay, settings, check)
+            source, steps = replay, self._replayed_steps(replay)
         elif self.files.track is not None:
-            source, steps = self._tracked_input(self.files.track)
+            source, steps = self._tracked(self.files.track)
         else:
-            source, steps = self._scripted_input()
-        frames = Frames(
-            self.rehearsal,
+            source, steps = self._scripted()
+        loop = HeadlessLoop(
+            rehearsal,
             source,
             self.measurements,
+            self._observers(Announcements(self.anatomy, self.notices), check),
+            settings,
             Tally(self.build_s),
+            self.notices,
+            self.resection,
             self.link,
-            self.files.resection_plan,
             self.files.warnings,
         )
-        with self._summarised(source, replay):
-            run_headless(
-                frames,
-                self.notices,
-                steps,
-                settings,
-                self.arch,
-                self.asked.out,
-                not self.asked.no_pictures,
-                self._about_patient(),
-            )
+        with self._summarised(check):
+            draws, about = not self.asked.no_pictures, self._about_patient()
+            run_headless(loop, steps, self.arch, self.asked.out, draws, self.files.resection_plan, about)
+
+    def _observers(self, announcements: Announcements, check: ReplayCheck | None) -> list[Observer]:
+        """Those of each frame, in this order: a new session is recorded before it is measured."""
+        self.recording = Recording(self, is_replay=check is not None)
+        observers: list[Observer] = [self.recording, self.measurements, announcements]
+        return observers if check is None else [*observers, check]
 
     def _about_patient(self) -> dict[str, Any]:
         """The complexity of the tumour and the warnings of the import, for the report."""
-        found = complexity(self.anatomy, self.rehearsal.scene.attachment.at_mm)
+        of_tumour = complexity(self.loaded, self.anatomy.case.scene.attachment.at_mm)
         return dict(
-            complexity=None if found is None else found.figures(),
+            complexity=None if of_tumour is None else of_tumour.figures(),
             import_warnings=list(self.files.warnings),
             acknowledged_warnings=list(self.files.acknowledged),
         )
 
     def _replayed_steps(self, replay: Replay) -> int:
-        steps, seconds = len(replay.log.poses) - replay.session.step_index, self.asked.seconds
-        if steps == 0:
+        """How many times around a replay takes: once for each move that is left."""
+        last = len(replay.log.commands)
+        if replay.place == last:
             raise CommandError(
                 f"the session has nothing after {self.asked.at:g} s: it is {replay.log.length_s:.1f} s long"
             )
-        if seconds is None:
-            return steps
-        return max(1, replay.log.step_at(replay.time_s + seconds) - replay.session.step_index)
+        if self.asked.seconds is not None:
+            last = max(replay.log.place_at(replay.time_s + self.asked.seconds), replay.place + 1)
+        return max(1, replay.moves_until(last))
 
-    def _tracked_input(self, track: TimedPoses) -> tuple[InputSource, int]:
+    def _tracked(self, track: TimedPoses) -> tuple[Source, int]:
         length_s = min(self.asked.seconds or np.inf, track.length_s)
         # One step at 0 s and one at the end.
-        return self._user_input(), 1 + int(length_s / self._step_s + 1e-9)
+        return self._user(), 1 + int(length_s / self._step_s + 1e-9)
 
-    def _scripted_input(self) -> tuple[InputSource, int]:
-        steps = max(1, round((self.asked.seconds or self.rehearsal.script_length_s()) / self._step_s))
-        session = self._session()
-        return ScriptedInput(session, self._record(session), steps), steps
+    def _scripted(self) -> tuple[Source, int]:
+        case, manipulator = self.anatomy.case, self.manipulator
+        length_s = script_length_s(case)
+        steps = max(1, round((self.asked.seconds or length_s) / self._step_s))
+
+        def next_pose(share: float, pose: np.ndarray) -> np.ndarray:
+            goal = scripted_pose(case, manipulator, length_s * share)
+            return manipulator.pose_towards(goal, pose, self._step_s)
+
+        return ScriptedPress(next_pose, steps), steps
 
     @property
     def _step_s(self) -> float:
-        return self.rehearsal.settings.time_step_s
+        return self.anatomy.case.scene.solver.time_step_s
 
-    def _session(self) -> Session:
-        return Session(self.rehearsal, coverage=lambda: self.measurements.coverage)
-
-    def _user_input(self, begins: RehearsalState | None = None) -> UserInput:
-        session = self._session()
-        recorder = self._record(session, begins)
-        tracked: PoseSource | None = None
-        script = None
-        if self.files.track is not None:
-            tracked = partial(played_pose, self.files.track, session)
-            script = ResectionScript(list(self.files.track.actions))
+    def _user(self, waits: bool = False) -> UserSource:
+        tracker = script = None
+        case, track = self.anatomy.case, self.files.track
+        if track is not None:
+            tracker = Tracker(partial(played_pose, track), case)
+            script = ResectionScript(list(track.actions))
         elif self.link is not None and self.asked.link_leads:
-            tracked = self.link.received_pose.pose
-        begun = begins is not None
-        return UserInput(session, recorder, begun, tracked, script, self.notices, self.files.resection_plan)
+            received = self.link.received_pose
+            tracker = Tracker(lambda time_s: received.pose(), case)
+        return UserSource(
+            self.anatomy,
+            self.manipulator,
+            self.notices,
+            tracker,
+            script,
+            self.files.resection_plan,
+            lambda points: self.measurements.coverage.is_seen(points),
+            waits,
+        )
 
-    def _replay_input(self, replay: Replay) -> ReplayInput:
-        return ReplayInput(replay, self._take_over, self.notices)
+    def _replay_in_window(self, log: Log, settings: Settings, check: ReplayCheck | None) -> ReplaySource:
+        replay = Replay(log)
+        self._open(replay, settings, check)
+        return ReplaySource(replay, self._take_over, self.notices)
 
-    def _take_over(self) -> UserInput:
+    def _take_over(self) -> UserSource:
         """The user continues where the replay is: in a new session."""
-        self.rehearsal.manipulator.match(self.rehearsal.pose)
-        self.rehearsal.settings.time_step_s = self.rehearsal.scene.solver.time_step_s
-        self.measurements.restart()
-        return self._user_input(self.rehearsal.snapshot())
+        self.manipulator.match(self.anatomy.pose)
+        return self._user(waits=True)
 
-    def _record(self, session: Session, begins: RehearsalState | None = None) -> SessionRecorder | None:
-        try:
-            self.recorder = record(session, self.anatomy, self.arch, self.asked.out, begins, self.notices)
-        except OSError as error:
-            click.echo(
-                f"Warning: this session is not recorded: {self.asked.out} cannot be written to ({error.strerror})"
-            )
-        return self.recorder
-
-    def _replay(self, log: Log, settings: Settings) -> Replay:
-        _echo(replay_warning(log.header, self.arch))
-        return open_session(log, self.asked.at, self.rehearsal, settings, self.measurements)
+    def _open(self, replay: Replay, settings: Settings, check: ReplayCheck | None) -> None:
+        _echo(replay_warning(replay.log.header, self.arch))
+        observers: list[Observer] = [self.measurements] if check is None else [self.measurements, check]
+        open_session(
+            replay, self.asked.at, self.built.stepper, self.anatomy, settings, self.measurements, observers
+        )
 
     @contextmanager
-    def _summarised(self, source: InputSource, replay: Replay | None) -> Iterator[None]:
+    def _summarised(self, check: ReplayCheck | None) -> Iterator[None]:
         """Print the summary at the end, also after Ctrl-C."""
         try:
             yield
         except KeyboardInterrupt:
-            click.echo(f"\nStopped at {source.session.time_s:.1f} s; until then:")
+            click.echo(f"\nStopped at {self.anatomy.frame.time_s:.1f} s; until then:")
             raise Exit(STOPPED) from None
         finally:
-            self._end(source.bookmarks)
-            _echo(_verdict(replay))
+            self._end()
+            _echo(_verdict(check, self.anatomy.frame))
 
     def _save_page(self, report: dict[str, Any]) -> None:
         """Write the page of the resection, and print its figures."""
@@ -231,13 +272,13 @@ class RehearsalRun:
 
         click.echo("\n".join(f"{name:<21}  {value}" for name, value in rows_of(report)))
         try:
-            click.echo("Saved " + " and ".join(map(str, save_page(self.rehearsal, report, self.asked.out))))
+            click.echo("Saved " + " and ".join(map(str, save_page(self.anatomy, report, self.asked.out))))
         except OSError as error:
             click.echo(f"Warning: the page of the resection is not saved: {error.strerror}")
 
-    def _resection(self) -> dict[str, Any] | None:
+    def _resection_report(self) -> dict[str, Any] | None:
         """The figures of the resection; None without any."""
-        if self.rehearsal.judgement is None:
+        if self.anatomy.judgement is None:
             return None
         # Matplotlib takes half a second to import.
         from rehearsal.resection.resection_page import report_of
@@ -246,10 +287,11 @@ class RehearsalRun:
         # Damaged since the start: the session must still end in order.
         with suppress(SceneError):
             warnings = open_warnings(self.files.scene, self.files.folder)
-        return report_of(self.rehearsal, self.files.resection_plan) | dict(import_warnings=list(warnings))
+        return report_of(self.anatomy, self.files.resection_plan) | dict(import_warnings=list(warnings))
 
-    def _end(self, bookmarks: int) -> None:
-        summary, report = self.measurements.summary(bookmarks), self._resection()
+    def _end(self) -> None:
+        bookmarks = len(self.anatomy.frame.bookmarks)
+        summary, report = self.measurements.summary(bookmarks), self._resection_report()
         click.echo(summary_text(summary))
         if report is not None:
             summary |= dict(resection=report)
@@ -258,15 +300,67 @@ class RehearsalRun:
         guide = self.measurements.guide
         if guide is not None:
             _echo(guide.in_words(summary.get(f"seen_{guide.plan.target}")))
-        if self.recorder is not None:
-            self.recorder.close(summary)
+        recorder = None if self.recording is None else self.recording.close(self.built.stepper, summary)
         # After the session is safe.
         if report is not None:
             self._save_page(report)
-        if self.recorder is not None:
+        if recorder is not None:
             scene = [] if self.asked.scene == EMBEDDED else [self.asked.scene]
-            again = shell_command("rehearse", *scene, "--replay", self.recorder.path)
-            click.echo(self.recorder.fault or f"Recorded; replay it with: {again}")
+            again = shell_command("rehearse", *scene, "--replay", recorder.path)
+            click.echo(recorder.fault or f"Recorded; replay it with: {again}")
+
+
+class Recording:
+    """An ``Observer``: records each session of a run in a file of its own. A replay is not recorded, but what follows it is."""
+
+    def __init__(self, run: RehearsalRun, is_replay: bool) -> None:
+        self._run = run
+        self.recorder: SessionRecorder | None = None
+        if not is_replay:
+            self._begin(None)
+
+    def observe(self, frame: Frame, probe: Probe) -> None:
+        """As ``Observer.observe``."""
+        if frame.begins is not None:
+            self._begin(frame.begins)
+        if self.recorder is not None:
+            self.recorder.observe(frame.of_session)
+
+    def close(self, stepper: Stepper, summary: dict[str, Any]) -> SessionRecorder | None:
+        """Record the last state, from which the session can be continued, and the summary."""
+        if self.recorder is None:
+            return None
+        # A solver that has ended has no last state; what is recorded can be replayed without it.
+        with suppress(SolverEnded):
+            stepper.submit(Checkpoint())
+            stepper.wait(LAST_STATE_S)
+            self.recorder.observe(stepper.newest())
+        self.recorder.close(summary)
+        return self.recorder
+
+    def _begin(self, event: Checkpointed | None) -> None:
+        run = self._run
+        case, begins = run.anatomy.case, None if event is None else event.state
+        header = header_of(
+            case, run.loaded, run.arch, run.built.serial, case.scene.solver.time_step_s, begins
+        )
+        try:
+            self.recorder = SessionRecorder(
+                next_path(run.asked.out),
+                header,
+                run.notices,
+                lambda: pack_seen(run.measurements.coverage.seen),
+            )
+        except OSError as error:
+            self.recorder = None
+            click.echo(
+                f"Warning: this session is not recorded: {run.asked.out} cannot be written to ({error.strerror})"
+            )
+        run.measurements.note = self._note
+
+    def _note(self, number: int, reading: dict[str, Any]) -> None:
+        if self.recorder is not None:
+            self.recorder.note(number, reading)
 
 
 def replay_warning(header: Header, arch: str) -> str:
@@ -280,15 +374,13 @@ def replay_warning(header: Header, arch: str) -> str:
     return ""
 
 
-def _verdict(replay: Replay | None) -> str:
+def _verdict(check: ReplayCheck | None, frame: Frame) -> str:
     """Whether a replay was the recorded session."""
-    if replay is None or replay.compared == 0:
+    if check is None or check.compared == 0:
         return ""
-    if replay.differs_s is not None:
-        return (
-            f"replay    differs from {replay.differs_s:.1f} s on: other bits, of another backend or version"
-        )
-    return f"replay    identical in all {replay.compared} states compared, to {replay.time_s:.1f} s; state {replay.state}"
+    if check.differs_s is not None:
+        return f"replay    differs from {check.differs_s:.1f} s on: other bits, of another backend or version"
+    return f"replay    identical in all {check.compared} states compared, to {check.compared_s:.1f} s; state {check.digest}"
 
 
 def _echo(text: str) -> None:

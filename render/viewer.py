@@ -287,10 +287,17 @@ class Controls:
     export: bool = False
     freeze: bool = False
     """Freeze or unfreeze."""
+    frozen: bool = False
+    """The rehearsal stands still."""
     screenshot: bool = False
     quit: bool = False
     message: str = ""
     """Message of an input device, such as that it was unplugged."""
+
+    @property
+    def restores(self) -> bool:
+        """Whether a state is restored or kept."""
+        return self.reset or self.undo or self.redo or self.bookmark or self.to_bookmark
 
     @property
     def operates(self) -> bool:

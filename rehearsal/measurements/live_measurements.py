@@ -1,22 +1,26 @@
 """Live measurements: figures four times a second, and the coverage of the organ by the images so far."""
 
+from collections.abc import Callable
 from dataclasses import asdict, fields, replace
 from typing import Any
 
 import numpy as np
 
+from rehearsal.deformed_anatomy import DeformedAnatomy
+from rehearsal.loop.command import Move
+from rehearsal.loop.frame import Frame
+from rehearsal.loop.timeline import periods
 from rehearsal.measurements.session_summary import SessionCourse
 from rehearsal.measurements.tumour_measurements import Measurement, measure
 from rehearsal.measurements.uncertainty_bands import UncertaintyBands
 from rehearsal.planning.plan_guidance import PlanGuidance
-from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.judgement import findings_of
 from rehearsal.sessions.packed_arrays import unpack_seen
-from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import Log, SessionError
 from render.viewer import Settings, View
 from ultrasound.coverage import GRID_POINTS, Coverage, Gap
 from ultrasound.probe import Probe
+from ultrasound.probe_manipulator import ProbeManipulator
 from ultrasound.scanner import B_MODE
 
 MEASURE_S, COVERAGE_S = 0.25, 1 / 30
@@ -24,35 +28,39 @@ MARGIN_MM = 5.0
 # With less than this share of the scanlines in contact the B-mode image shows nothing.
 LEAST_CONTACT = 0.05
 COMPRESSION = "compression"
+# Commands after which the tissue is as it was before.
+RESTORES = "undo", "redo", "reset", "go to"
 # Digits of a recorded measurement, and of what the summary counts, so that the summary follows from the record.
 DIGITS = 4
 
 
 class LiveMeasurements:
     """``latest`` is the last measurement, ``coverage`` that of the whole session, ``guide`` the guidance along a plan, ``bands`` how far
-    measurements may differ, if any.
+    measurements may differ, if any. ``note`` is called with each measurement and the number of its state.
     """
 
     def __init__(
         self,
-        rehearsal: Rehearsal,
+        anatomy: DeformedAnatomy,
+        manipulator: ProbeManipulator,
         guide: PlanGuidance | None = None,
         bands: UncertaintyBands | None = None,
     ) -> None:
-        self.rehearsal, self.guide, self.bands = rehearsal, guide, bands
+        self.anatomy, self.manipulator, self.guide, self.bands = anatomy, manipulator, guide, bands
+        self.note: Callable[[int, dict[str, Any]], None] = lambda number, reading: None
         self.margin_mm = MARGIN_MM if guide is None else guide.plan.margin_mm
         self._coverage: Coverage | None = None
         self._begin()
 
     def _begin(self) -> None:
-        rehearsal = self.rehearsal
-        self.course = SessionCourse(rehearsal.scene.transducer.compression_warning_mm)
+        case = self.anatomy.case
+        self.course = SessionCourse(case.scene.transducer.compression_warning_mm)
         # The last period of each in which it was done.
         self._measured = self._covered = -1
         self.latest: Measurement | None = None
         self._seen: dict[str, np.ndarray] = {}
         self._findings: dict[str, str] = {}
-        self._touches = np.ones(rehearsal.probe.number_of_scanlines, bool)
+        self._touches = np.ones(case.probe.number_of_scanlines, bool)
 
     def restart(self) -> None:
         """Start a new session: no coverage, nothing to sum up."""
@@ -62,7 +70,7 @@ class LiveMeasurements:
             self.guide.restart()
 
     def recall(self, log: Log, until: int) -> bool:
-        """Restore the measurements of a session's first steps if its file holds the coverage until then; return whether it does.
+        """Restore the measurements of a session's first states if its file holds the coverage until then; return whether it does.
 
         Raises SessionError.
         """
@@ -75,14 +83,17 @@ class LiveMeasurements:
                 "another body"
             )
         self.coverage.seen = seen
-        for step, pose in enumerate(log.poses[:until], 1):
-            for event in log.events.get(step, []):
-                if event.kind == "reading":
-                    self.latest = _recorded_measurement(event.value)
-            is_rollback = bool(np.isnan(pose).any())
-            if self.guide is not None and not is_rollback:
-                self.guide.watch(pose)
-            self.count(None if is_rollback else pose, log.lengths_s[step - 1])
+        for number, command in log.commands:
+            if number >= until:
+                break
+            if number in log.readings:
+                self.latest = _recorded_measurement(log.readings[number])
+            if isinstance(command, Move):
+                if self.guide is not None:
+                    self.guide.follow(command.pose)
+                self.count(command.pose, command.length_s or log.header.time_step_s)
+            elif command.kind in RESTORES:
+                self.count(None, 0.0)
         self._show()
         return True
 
@@ -102,26 +113,33 @@ class LiveMeasurements:
         return self._coverage
 
     def _new_coverage(self) -> Coverage:
-        return Coverage(self.rehearsal.whole_organ, self.rehearsal.whole_tumour, self.margin_mm)
+        return Coverage(self.anatomy.case.organ, self.anatomy.case.tumour, self.margin_mm)
 
-    def watch(self, session: Session, probe: Probe, is_rollback: bool = False) -> None:
-        """Update the coverage, measure and record when due, after an image: of a step, or of a rollback."""
+    def observe(self, frame: Frame, probe: Probe) -> None:
+        """Update the coverage by the image of a frame; measure where that is due, and after a rollback."""
+        if frame.begins is not None:
+            self.restart()
+            frame = frame.of_session
         # After a rollback the latest measurement is out of date.
-        is_due = is_rollback or self.latest is None
+        is_due = bool(frame.restored) or self.latest is None
         if (
-            is_due or periods(session.time_s, COVERAGE_S) != self._covered
-        ) and self.rehearsal.scanner is not None:
-            self._covered = periods(session.time_s, COVERAGE_S)
-            image = self.rehearsal.scene.image
-            rest = self.rehearsal.scanner.plane.rest_grid(GRID_POINTS)
+            is_due or periods(frame.time_s, COVERAGE_S) != self._covered
+        ) and self.anatomy.scanner is not None:
+            self._covered = periods(frame.time_s, COVERAGE_S)
+            image = self.anatomy.case.scene.image
+            rest = self.anatomy.scanner.plane.rest_grid(GRID_POINTS)
             self._touches = self.coverage.add(rest, probe, image.coupling_gap_mm)
         if self.guide is not None:
-            self.guide.go_with(session)
-        if is_due or periods(session.time_s, MEASURE_S) != self._measured:
-            self._measured = periods(session.time_s, MEASURE_S)
-            self.latest = measure(self.rehearsal, probe, self._touches)
-            session.note("reading", self.figures())
+            self.guide.observe(frame)
+        if is_due or periods(frame.time_s, MEASURE_S) != self._measured:
+            self._measured = periods(frame.time_s, MEASURE_S)
+            self.latest = measure(self.anatomy, probe, self._touches)
+            self.note(frame.number, self.figures())
             self._show()
+        for step in frame.steps:
+            self.count(step.pose, step.length_s)
+        for _ in frame.restored:
+            self.count(None, 0.0)
 
     def count(self, pose: np.ndarray | None, length_s: float) -> None:
         """Count a step by its pose (4, 4) and its length [s], or a rollback by None, for the summary."""
@@ -136,7 +154,7 @@ class LiveMeasurements:
 
     def _show(self) -> None:
         """Update what the window shows."""
-        surfaces = {"organ": self.rehearsal.organ, "tumour": self.rehearsal.tumour}
+        surfaces = {"organ": self.anatomy.organ, "tumour": self.anatomy.tumour}
         self._seen = {
             name: self.coverage.is_seen(np.asarray(surface.vertices))
             for name, surface in surfaces.items()
@@ -147,7 +165,7 @@ class LiveMeasurements:
     def figures(self) -> dict[str, Any]:
         """The latest measurement and the coverage so far, rounded, for the record."""
         values = asdict(self.latest) if self.latest is not None else {}
-        if self.rehearsal.scanner is not None:
+        if self.anatomy.scanner is not None:
             values |= {f"seen_{target}": self.coverage.fraction(target) for target in self.coverage.targets}
         if self.guide is not None:
             values |= self.guide.figures()
@@ -159,14 +177,14 @@ class LiveMeasurements:
     def summary(self, bookmarks: int = 0) -> dict[str, Any]:
         """The summary so far."""
         gaps: list[Gap] = []
-        if self.rehearsal.scanner is not None:
+        if self.anatomy.scanner is not None:
             gaps = self.coverage.gaps("margin" if "margin" in self.coverage.targets else "organ")
         return self.course.summary(self.figures(), gaps, bookmarks)
 
     @property
     def is_over_limit(self) -> bool:
         """Whether the tissue is compressed by more than the scene's limit."""
-        limit = self.rehearsal.scene.transducer.compression_warning_mm
+        limit = self.anatomy.case.scene.transducer.compression_warning_mm
         return self.latest is not None and self.latest.compression_mm > limit
 
     def onto(self, view: View, settings: Settings) -> View:
@@ -186,14 +204,14 @@ class LiveMeasurements:
 
     def _shown_coverage(self) -> dict[str, np.ndarray]:
         """What was imaged of each surface, unless a cut has changed the surface since."""
-        surfaces = {"organ": self.rehearsal.organ, "tumour": self.rehearsal.tumour}
+        surfaces = {"organ": self.anatomy.organ, "tumour": self.anatomy.tumour}
         counts = {name: len(each.vertices) for name, each in surfaces.items() if each is not None}
         return {name: seen for name, seen in self._seen.items() if counts.get(name) == len(seen)}
 
     def findings(self) -> dict[str, str]:
         """Name -> figure with its unit."""
-        if self.rehearsal.judgement is not None:
-            return findings_of(self.rehearsal.judgement)
+        if self.anatomy.judgement is not None:
+            return findings_of(self.anatomy.judgement)
         found, plan = self._tissue_findings(), self.guide.figures() if self.guide is not None else {}
         if plan:
             off_mm, off_deg = plan["plan_off_mm"], plan["plan_off_deg"]
@@ -209,7 +227,7 @@ class LiveMeasurements:
         if latest.force_n is not None:
             found["force"] = self._with_band("force_n", latest.force_n, "N", 2)
         if latest.to_tumour_mm is None:
-            return found if self.rehearsal.scanner is None else found | {"organ seen": self._share("organ")}
+            return found if self.anatomy.scanner is None else found | {"organ seen": self._share("organ")}
         found |= {
             "to tumour": self._with_band("to_tumour_mm", latest.to_tumour_mm),
             "tumour depth": self._with_band("tumour_depth_mm", latest.tumour_depth_mm),
@@ -228,7 +246,7 @@ class LiveMeasurements:
             return ""
         band = None
         if self.bands is not None:
-            band = self.bands.around(name, value, self.rehearsal.indentation_mm())
+            band = self.bands.around(name, value, self.manipulator.indentation_mm(self.anatomy.pose))
         if band is None:
             return f"{_rounded(value, digits)} {unit}"
         # Of these only a margin can be negative.
@@ -237,11 +255,6 @@ class LiveMeasurements:
 
     def _share(self, target: str) -> str:
         return f"{100 * self.coverage.fraction(target):.0f} %"
-
-
-def periods(time_s: float, period_s: float) -> int:
-    """How many whole periods a sum of steps has lasted."""
-    return int(time_s / period_s + 1e-6)
 
 
 def _mm(length: float) -> str:

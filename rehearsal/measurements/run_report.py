@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rehearsal.configuration import STEP, Setup
+from rehearsal.loop.frame import Frame
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import counted, spread
 from rehearsal.speed_accuracy import expected_error_mm, load_points
 from scenes.tissue import TISSUES
-from sim.fields import array_of
 from version import VERSION
 
 # Keys that some tissue models leave open.
@@ -18,9 +18,9 @@ NOT_EVERYWHERE = dict(radius_mm=None, stiffness=None, clusters=0, memberships=0)
 
 def numerical_error_of(rehearsal: Rehearsal) -> float | None:
     """Mean bead error [mm] on other kidneys, of known material, that ``study trade`` measured with similar settings; None if there are none."""
-    step = rehearsal.settings
+    case, step = rehearsal.case, rehearsal.organ.settings
     changed = {name: getattr(step, name) for name in STEP}
-    setup = Setup(rehearsal.scene.tissue, rehearsal.scene.solver.model_copy(update=changed))
+    setup = Setup(case.scene.tissue, case.scene.solver.model_copy(update=changed))
     return expected_error_mm(load_points(), setup)
 
 
@@ -38,48 +38,51 @@ class Tally:
     indentation_max_mm: float = 0.0
     force_max_n: float = 0.0
 
-    def watch(self, rehearsal: Rehearsal) -> None:
-        """Add the state after a step; the surfaces must be up to date."""
-        if rehearsal.notice:
-            self.fallbacks.append(rehearsal.notice)
-        self.finite &= bool(np.isfinite(array_of(rehearsal.body.position)).all())
+    def add(self, rehearsal: Rehearsal, frame: Frame) -> None:
+        """Add a frame of a rehearsal that shows it."""
+        self.step_ms += [step.took_ms for step in frame.steps]
+        self.fallbacks += [step.notice for step in frame.steps if step.notice]
+        # After a rollback the tissue is restored, but the tool only with the next step.
+        if not frame.steps or frame.restored:
+            return
+        self.finite &= bool(np.isfinite(frame.positions).all())
         if not self.finite:
             return
-        self.volume_ratio_min = min(self.volume_ratio_min, rehearsal.volume_ratio())
-        self.max_penetration_mm = max(self.max_penetration_mm, rehearsal.contacts.measure_penetration())
+        self.volume_ratio_min = min(self.volume_ratio_min, rehearsal.anatomy.volume_ratio())
+        penetration_mm = rehearsal.organ.contacts.measure_penetration()
+        self.max_penetration_mm = max(self.max_penetration_mm, penetration_mm)
         self.indentation_max_mm = max(self.indentation_max_mm, rehearsal.indentation_mm())
-        wrench = rehearsal.wrench()
-        if wrench is not None:
-            self.force_max_n = max(self.force_max_n, float(np.linalg.norm(wrench[:3])))
+        if frame.wrench is not None:
+            self.force_max_n = max(self.force_max_n, float(np.linalg.norm(frame.wrench[:3])))
 
     def report(self, rehearsal: Rehearsal, arch: str) -> dict:
         """The report; times [ms] without the first step, None if nothing was timed; no figures of tissue that is not finite."""
-        settings = rehearsal.settings
-        wrench = rehearsal.wrench() if self.finite else None
+        case, settings = rehearsal.case, rehearsal.organ.settings
+        wrench = rehearsal.frame.wrench if self.finite else None
         return dict(
             version=VERSION,
-            title=rehearsal.scene.title,
+            title=case.scene.title,
             arch=arch,
             **(
                 NOT_EVERYWHERE
-                | rehearsal.scene.tissue.model_dump(exclude={"parts"})
-                | rehearsal.model.counts()
+                | case.scene.tissue.model_dump(exclude={"parts"})
+                | rehearsal.organ.model.counts()
             ),
             parts={
                 part.name: dict(young_kpa=part.material.young_kpa, poisson=part.material.poisson)
-                for part in rehearsal.parts_of_tissue
+                for part in rehearsal.organ.parts_of_tissue
             },
-            tetrahedra=rehearsal.embedding.count,
-            time_step_s=rehearsal.scene.solver.time_step_s,
+            tetrahedra=rehearsal.anatomy.embedding.count,
+            time_step_s=case.scene.solver.time_step_s,
             substeps=settings.substeps,
             iterations=settings.iterations,
-            probe=rehearsal.probe.transducer_name,
-            probe_settings=rehearsal.probe.model_dump(by_alias=True),
-            picture=rehearsal.scene.image.mode,
-            detail_level=rehearsal.scene.image.detail_level,
-            slice_width_mm=rehearsal.probe.extent_mm[0],
-            slice_depth_mm=rehearsal.probe.depth_mm,
-            steps=rehearsal.steps,
+            probe=case.probe.transducer_name,
+            probe_settings=case.probe.model_dump(by_alias=True),
+            picture=case.scene.image.mode,
+            detail_level=case.scene.image.detail_level,
+            slice_width_mm=case.probe.extent_mm[0],
+            slice_depth_mm=case.probe.depth_mm,
+            steps=rehearsal.organ.steps,
             ms_per_step=_times(self.step_ms),
             ms_per_slice=_times(self.slice_ms),
             build_s=round(self.build_s, 3),

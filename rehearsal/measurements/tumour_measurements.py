@@ -6,8 +6,7 @@ from typing import Any
 import igl
 import numpy as np
 
-from rehearsal.rehearsal import Rehearsal
-from sim.fields import array_of
+from rehearsal.deformed_anatomy import DeformedAnatomy
 from ultrasound.array_contact import face_points, measure_contact
 from ultrasound.probe import Probe
 
@@ -36,37 +35,36 @@ class Measurement:
     """Torque [N mm] of that force about the centre of the array face."""
 
 
-def measure(rehearsal: Rehearsal, probe: Probe, touches: np.ndarray) -> Measurement:
-    """Measure a rehearsal whose surfaces are up to date; ``touches`` (n,): which scanlines are in contact."""
-    organ = rehearsal.organ
-    now = array_of(rehearsal.organ_skin.vertices).astype(float)
+def measure(anatomy: DeformedAnatomy, probe: Probe, touches: np.ndarray) -> Measurement:
+    """Measure an anatomy as it is shown; ``touches`` (n,): which scanlines are in contact."""
+    organ, now = anatomy.organ, anatomy.vertices
     pressed = measure_contact(
-        rehearsal.pose, rehearsal.size_mm, probe.radius_mm, now, np.asarray(organ.vertices), organ.faces
+        anatomy.pose, anatomy.case.size_mm, probe.radius_mm, now, np.asarray(organ.vertices), organ.faces
     )
     always: dict[str, Any] = dict(compression_mm=pressed.compression_mm, contact_mm2=pressed.area_mm2)
-    wrench = rehearsal.wrench()
+    wrench = anatomy.frame.wrench
     if wrench is not None:
         always |= dict(
             force_n=float(np.linalg.norm(wrench[:3])), torque_n_mm=float(np.linalg.norm(wrench[3:]))
         )
-    outline = rehearsal.tumour_outline()
-    if outline is None or rehearsal.tumour is None:
+    outline = anatomy.tumour_outline()
+    if outline is None or anatomy.tumour is None:
         return Measurement(**always)
-    tumour = rehearsal.tumour_vertices()
-    middle, before = tumour.mean(axis=0), np.asarray(rehearsal.tumour.vertices).mean(axis=0)
+    tumour = anatomy.tumour_vertices
+    middle, before = tumour.mean(axis=0), np.asarray(anatomy.tumour.vertices).mean(axis=0)
     return Measurement(
         **always,
-        to_tumour_mm=_to_tumour_mm(rehearsal, probe, tumour),
+        to_tumour_mm=_to_tumour_mm(anatomy, probe, tumour),
         tumour_depth_mm=_depth_mm(tumour, now, organ.faces),
         tumour_shift_mm=float(np.linalg.norm(middle - before)),
         **_in_image(outline, probe, touches),
     )
 
 
-def _to_tumour_mm(rehearsal: Rehearsal, probe: Probe, tumour: np.ndarray) -> float:
-    points = face_points(rehearsal.size_mm, probe.radius_mm)[0]
-    places = points @ rehearsal.pose[:3, :3].T + rehearsal.pose[:3, 3]
-    return float(np.sqrt(_nearest(places, tumour, rehearsal.tumour.faces)[0].min()))  # type: ignore[union-attr]
+def _to_tumour_mm(anatomy: DeformedAnatomy, probe: Probe, tumour: np.ndarray) -> float:
+    points = face_points(anatomy.case.size_mm, probe.radius_mm)[0]
+    places = points @ anatomy.pose[:3, :3].T + anatomy.pose[:3, 3]
+    return float(np.sqrt(_nearest(places, tumour, anatomy.tumour.faces)[0].min()))  # type: ignore[union-attr]
 
 
 def _depth_mm(tumour: np.ndarray, organ: np.ndarray, faces: np.ndarray) -> float:

@@ -4,13 +4,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rehearsal.coordinates import transducer_at
+from rehearsal.case import Case
+from rehearsal.loop.frame import Frame
 from rehearsal.planning.plan_file import Plan, PlannedSweep
 from rehearsal.planning.sweep_score import face_centres
-from rehearsal.rehearsal import Rehearsal
-from rehearsal.sessions.session import Session
 from render.viewer import Guidance
-from ultrasound.probe_manipulator import advanced, indentation
+from ultrasound.probe_manipulator import ProbeManipulator, advanced, indentation
 
 # A probe farther than NEAR_MM from the sweep does not follow it; within REACHED_MM a pose is reached.
 NEAR_MM, REACHED_MM = 6.0, 1.0
@@ -37,17 +36,17 @@ class _Progress(NamedTuple):
 class PlanGuidance:
     """Guides along one sweep of a plan. ``number`` is the index of the sweep; one past the last shows none."""
 
-    def __init__(self, rehearsal: Rehearsal, plan: Plan, number: int = 0) -> None:
-        self.rehearsal, self.plan, self.number = rehearsal, plan, number
+    def __init__(self, case: Case, manipulator: ProbeManipulator, plan: Plan, number: int = 0) -> None:
+        self.case, self.manipulator, self.plan, self.number = case, manipulator, plan, number
         self.restart()
 
     def restart(self) -> None:
         """Begin the sweep anew."""
-        passes = passes_in(self.rehearsal, self.plan.sweeps[self.number]) if self._is_shown else []
+        passes = passes_in(self.case, self.plan.sweeps[self.number]) if self._is_shown else []
         self._poses = np.concatenate([np.zeros((0, 4, 4)), *passes])
         count = len(self._poses)
         self._progress = _Progress(0, np.zeros((count, 2)), np.full(count, np.inf))
-        self._history: dict[int, _Progress] = {}
+        self._progress_at: dict[int, _Progress] = {}
         drawn = np.array([self._above(pose) for pose in self._poses]).reshape(-1, 3)
         # Each segment ends at a pose that is not the first of its pass.
         firsts = np.cumsum([0, *map(len, passes)])
@@ -65,7 +64,7 @@ class PlanGuidance:
 
     def _above(self, pose: np.ndarray) -> np.ndarray:
         """The centre (3,) of the array face, moved out above the settled organ."""
-        manipulator = self.rehearsal.manipulator
+        manipulator = self.manipulator
         depth = indentation(pose, manipulator.size_mm, manipulator.samples, manipulator.radius_mm)
         return face_centres(manipulator, advanced(pose, -max(depth, 0.0) - ABOVE_MM)[None])[0]
 
@@ -82,22 +81,22 @@ class PlanGuidance:
         sweep = self.plan.sweeps[self.number]
         return f"Plan {self.number + 1}: {sweep.name}, covers {100 * sweep.coverage:.0f} %"
 
-    def go_with(self, session: Session) -> None:
-        """Take a session's last step; after an undo or a redo, restore the progress of that step."""
-        known = dict.fromkeys(session.kept_states, self._progress) | self._history
-        if session.rolled_back_to is not None:
-            self._progress = known.get(session.rolled_back_to, self._progress)
-        self._history = {step: known[step] for step in session.kept_states}
-        self.watch(self.rehearsal.pose)
+    def observe(self, frame: Frame) -> None:
+        """Take a frame's pose; after an undo or a redo, restore the progress of that state."""
+        known = dict.fromkeys(frame.kept, self._progress) | self._progress_at
+        for number in frame.restored:
+            self._progress = known.get(number, self._progress)
+        self._progress_at = {number: known[number] for number in frame.kept}
+        self.follow(frame.pose)
 
-    def watch(self, pose: np.ndarray) -> None:
+    def follow(self, pose: np.ndarray) -> None:
         """Take the transducer's pose (4, 4)."""
         at, deviation, combined = self._progress
         first = max(at - AHEAD, 0)
         now = self._deviation(pose, self._poses[first : at + AHEAD])
         now_mm = now[:, 0] + now[:, 1] / DEG_PER_MM_OFF
         closer = first + np.flatnonzero(now_mm < combined[first : at + AHEAD])
-        # The history refers to the old arrays.
+        # The kept progress refers to the old arrays.
         deviation, combined = deviation.copy(), combined.copy()
         deviation[closer], combined[closer] = now[closer - first], now_mm[closer - first]
         ahead = now_mm[at - first :]
@@ -109,7 +108,7 @@ class PlanGuidance:
 
     def _deviation(self, pose: np.ndarray, others: np.ndarray) -> np.ndarray:
         """The distances of a pose from others (n, 4, 4), (n, 2): of the centre of the array face [mm], and angular [degrees]."""
-        manipulator = self.rehearsal.manipulator
+        manipulator = self.manipulator
         away = np.linalg.norm(
             face_centres(manipulator, others) - face_centres(manipulator, pose[None]), axis=1
         )
@@ -148,6 +147,6 @@ class PlanGuidance:
         return text
 
 
-def passes_in(rehearsal: Rehearsal, sweep: PlannedSweep) -> list[np.ndarray]:
-    """The transducer's poses (n, 4, 4) in a rehearsal, on each pass of a sweep."""
-    return [np.stack([transducer_at(rehearsal, pose) for pose in each]) for each in sweep.poses()]
+def passes_in(case: Case, sweep: PlannedSweep) -> list[np.ndarray]:
+    """The transducer's poses (n, 4, 4) of a case, on each pass of a sweep."""
+    return [np.stack([case.transducer_at(pose) for pose in poses]) for poses in sweep.poses()]

@@ -6,15 +6,15 @@ from time import perf_counter
 
 from joblib import cpu_count
 
+from rehearsal.case import Case
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.notices import Notices
-from rehearsal.open_window import probe_with_settings
 from rehearsal.planning.plan_file import Plan, PlanError, next_plan_path, write_plan
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plan_search import make_plan, total_work
 from rehearsal.planning.sweep_trial import PlanningProblem
 from rehearsal.planning.trial_workers import TrialWorkers
-from rehearsal.rehearsal import Rehearsal
+from rehearsal.settings import probe_with_settings
 from rehearsal.worker_processes import WorkerError, Workers
 from render.viewer import Controls, Settings
 from scenes.anatomy import LoadedAnatomy
@@ -78,13 +78,13 @@ class PlanControl:
 
     def __init__(
         self,
-        rehearsal: Rehearsal,
+        case: Case,
         anatomy: LoadedAnatomy,
         measurements: LiveMeasurements,
         out: Path,
         notices: Notices,
     ) -> None:
-        self.rehearsal, self.anatomy, self.measurements, self.out = rehearsal, anatomy, measurements, out
+        self.case, self.anatomy, self.measurements, self.out = case, anatomy, measurements, out
         self.notices = notices
         self._job: PlanJob | None = None
         self._plan_for: Target = Settings().plan_for
@@ -94,7 +94,7 @@ class PlanControl:
         """A line for the panel while a plan is made."""
         return "" if self._job is None else self._job.status
 
-    def watch(self, controls: Controls) -> None:
+    def control(self, controls: Controls) -> None:
         """Take a frame's controls, and a search that has ended."""
         if controls.next_plan:
             self._stop_or_next_sweep()
@@ -102,12 +102,12 @@ class PlanControl:
             self._begin(controls.settings)
         elif controls.settings.plan_for != self._plan_for:
             self._plan_for = controls.settings.plan_for
-            no_tumour = "" if self.rehearsal.tumour is not None else "No tumour here. "
+            no_tumour = "" if self.case.tumour is not None else "No tumour here. "
             target = TARGET_NAMES[self._target(controls.settings)]
             self.notices.post(f"{no_tumour}A plan for {target}: {{plan}}")
         elif self._job is not None and self._job.result.done():
             job, self._job = self._job, None
-            self._take(job)
+            self._follow(job)
 
     def stop(self) -> None:
         """Cancel a search."""
@@ -124,7 +124,7 @@ class PlanControl:
             self.notices.post(guide.next_sweep() if guide is not None else "No plan: {plan} makes one")
 
     def _target(self, settings: Settings) -> Target:
-        return settings.plan_for if self.rehearsal.tumour is not None else "organ"
+        return settings.plan_for if self.case.tumour is not None else "organ"
 
     def _begin(self, settings: Settings) -> None:
         if self._job is not None:
@@ -139,16 +139,16 @@ class PlanControl:
             "solver.substeps": settings.substeps,
             "gravity.acceleration_m_s2": settings.gravity_m_s2,
         }
-        scene = with_options(self.rehearsal.scene, values)
-        probe = probe_with_settings(self.rehearsal.probe, settings)
+        scene = with_options(self.case.scene, values)
+        probe = probe_with_settings(self.case.probe, settings)
         margin_mm = float(settings.margin_mm)
         problem = PlanningProblem(scene, self.anatomy, probe, target, margin_mm, scene.trocar)
         self._job = PlanJob(problem, next_plan_path(self.out))
         self.notices.post(f"Planning for {TARGET_NAMES[target]}")
 
-    def _take(self, job: PlanJob) -> None:
+    def _follow(self, job: PlanJob) -> None:
         try:
-            guide = PlanGuidance(self.rehearsal, job.result.result())
+            guide = PlanGuidance(self.case, self.measurements.manipulator, job.result.result())
         except (PlanError, WorkerError) as error:
             self.notices.post(str(error))
         except OSError as error:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from rehearsal.pressed_organ import Step
+    from rehearsal.loop.frame import Step
 
 # Frames that are kept.
 MOST_FRAMES = 20_000

@@ -19,7 +19,7 @@ END_S = 2.0
 
 @dataclass(frozen=True)
 class StartedProcess:
-    """A process that waits for requests on a connection."""
+    """A process that waits for commands on a connection; None ends it."""
 
     process: BaseProcess
     connection: Connection
@@ -27,7 +27,7 @@ class StartedProcess:
     def close(self) -> None:
         """End the process in order, so that it stores its kernels."""
         with suppress(OSError):
-            self.connection.send(("stop", ()))
+            self.connection.send(None)
         self.process.join(END_S)
         self.kill()
 

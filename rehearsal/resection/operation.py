@@ -1,21 +1,19 @@
-"""The surgeon's actions of a resection: set marks on the capsule, and cut. Each is noted in the session, so that it can be replayed."""
+"""The surgeon's actions of a resection: where marks of the score are on the capsule, and what a cut is given."""
 
 import base64
 from collections.abc import Callable
-from dataclasses import asdict, replace
-from typing import Any
+from dataclasses import asdict
 
 import igl
 import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
 
-from rehearsal.rehearsal import Rehearsal
+from rehearsal.case import Case
+from rehearsal.deformed_anatomy import DeformedAnatomy
+from rehearsal.loop.command import CutOut
 from rehearsal.resection.cut import CutSettings
-from rehearsal.resection.resection_state import CutRequest, Resection
 from rehearsal.resection.score_line import ResectionError, ScoreLine, places_on
-from rehearsal.sessions.session import Session
-from sim.fields import array_of
 from ultrasound.scanner import plane_section
 
 # Which of points at rest (n, 3) [mm] the images have shown so far.
@@ -24,73 +22,44 @@ IsSeen = Callable[[np.ndarray], np.ndarray]
 LEAST_SEEN = 0.8
 
 
-def set_marks(session: Session, marks: np.ndarray, replaces: bool = False) -> None:
-    """Add marks (n, 3) at rest [mm] to the score, or have them instead of those that are set. Raises ResectionError."""
-    rehearsal = session.rehearsal
-    before = replace(rehearsal.resection, marks=()) if replaces else rehearsal.resection
-    resection = before.with_marks(marks)
-    session.note("marks", [list(mark) for mark in resection.marks])
-    rehearsal.set_resection(resection)
-
-
-def cut(session: Session, settings: CutSettings, is_seen: IsSeen | None) -> None:
-    """Cut along the score. Without ``is_seen`` all of the tumour counts as seen. Raises ResectionError, and nothing has changed."""
-    rehearsal = session.rehearsal
-    if rehearsal.cut is not None:
-        raise ResectionError("the specimen is cut out already; undo the cut before you make another")
-    tumour = rehearsal.whole_tumour
-    if tumour is None and settings.depth_mm is None:
-        raise ResectionError("this patient has no tumour that would give the depth of the cut; set a depth")
+def cut_command(anatomy: DeformedAnatomy, settings: CutSettings, is_seen: IsSeen | None) -> CutOut:
+    """A cut along the score. Without ``is_seen`` all of the tumour counts as seen."""
+    tumour = anatomy.case.tumour
     points = np.zeros((0, 3)) if tumour is None else np.asarray(tumour.vertices)
     seen = np.ones(len(points), bool) if is_seen is None else is_seen(points)
-    request = CutRequest.of(settings, seen, rehearsal.body.snapshot().position)
-    rehearsal.set_resection(replace(rehearsal.resection, cut=request))
-    session.note("cut", asdict(settings) | dict(seen=base64.b64encode(request.seen).decode("ascii")))
+    return CutOut(**asdict(settings), seen=base64.b64encode(np.packbits(seen)).decode("ascii"))
 
 
-def seen_share(rehearsal: Rehearsal) -> float:
+def seen_share(anatomy: DeformedAnatomy) -> float:
     """The share of the tumour's surface that the images had shown when it was cut; 1 without a cut or a tumour."""
-    request, tumour = rehearsal.resection.cut, rehearsal.whole_tumour
+    request, tumour = anatomy.frame.resection.cut, anatomy.case.tumour
     if request is None or tumour is None:
         return 1.0
     return float(request.seen_of(len(tumour.vertices)).mean())
 
 
-def repeat_cut(rehearsal: Rehearsal, recorded: dict[str, Any]) -> None:
-    """Make a recorded cut again. Raises ResectionError."""
-    values = {name: value for name, value in recorded.items() if name != "seen"}
-    position = rehearsal.body.snapshot().position.tobytes()
-    request = CutRequest(CutSettings(**values), base64.b64decode(recorded["seen"]), position)
-    rehearsal.set_resection(replace(rehearsal.resection, cut=request))
-
-
-def repeat_marks(rehearsal: Rehearsal, recorded: list[list[float]]) -> None:
-    """Set the marks of a recorded score. Raises ResectionError."""
-    rehearsal.set_resection(Resection(tuple((x, y, z) for x, y, z in recorded)))
-
-
-def places_at_rest(rehearsal: Rehearsal, points: np.ndarray) -> np.ndarray:
+def places_at_rest(case: Case, points: np.ndarray) -> np.ndarray:
     """Places (n, 3) of the organ's surface at rest that are nearest to points (n, 3) of the patient (LPS, mm)."""
-    return places_on(rehearsal.whole_organ, points - rehearsal.origin)[0]
+    return places_on(case.organ, points - case.origin)[0]
 
 
-def mark_under(rehearsal: Rehearsal, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+def mark_under(anatomy: DeformedAnatomy, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """The place (1, 3) at rest [mm] of the organ's surface where a ray first meets it. Raises ResectionError where it does not."""
-    now, faces = _surface_now(rehearsal)
+    now, faces = _surface_now(anatomy)
     hits = igl.ray_mesh_intersect(origin.astype(float), direction.astype(float), now, faces)
     if len(hits) == 0:
         raise ResectionError("the mark is not on the organ; click on its surface")
-    return rest_places(rehearsal, (origin + hits[0][1] * direction)[None])
+    return rest_places(anatomy, (origin + hits[0][1] * direction)[None])
 
 
-def marks_of_image(rehearsal: Rehearsal, margin_mm: float) -> np.ndarray:
+def marks_of_image(anatomy: DeformedAnatomy, margin_mm: float) -> np.ndarray:
     """The places (1 or 2, 3) at rest [mm] of the organ's surface in the image plane, a margin beside the lateral edges of the tumour that the
     image shows.
 
     It is the place nearest to the probe. Raises ResectionError where the image shows no edge, or the organ ends before the place.
     """
-    outline = rehearsal.tumour_outline()
-    plane = rehearsal.image_plane()
+    outline = anatomy.tumour_outline()
+    plane = anatomy.image_plane()
     shown_mm = plane.width_mm / 2
     edges = []
     if outline is not None and len(outline):
@@ -100,9 +69,9 @@ def marks_of_image(rehearsal: Rehearsal, margin_mm: float) -> np.ndarray:
         ]
     if not edges:
         raise ResectionError("the image shows no lateral edge of the tumour; move the probe over one")
-    surface = plane_section(*_surface_now(rehearsal), np.linalg.inv(plane.world_from_plane))
+    surface = plane_section(*_surface_now(anatomy), np.linalg.inv(plane.world_from_plane))
     places = np.array([[*_nearest_to_probe(surface, edge), 0.0, 1.0] for edge in edges])
-    return rest_places(rehearsal, (places @ plane.world_from_plane.T)[:, :3])
+    return rest_places(anatomy, (places @ plane.world_from_plane.T)[:, :3])
 
 
 def _nearest_to_probe(section: np.ndarray, across_mm: float) -> tuple[float, float]:
@@ -118,17 +87,17 @@ def _nearest_to_probe(section: np.ndarray, across_mm: float) -> tuple[float, flo
     return across_mm, float((start[:, 1] + share * (end[:, 1] - start[:, 1])).min())
 
 
-def rest_places(rehearsal: Rehearsal, points: np.ndarray) -> np.ndarray:
+def rest_places(anatomy: DeformedAnatomy, points: np.ndarray) -> np.ndarray:
     """The places at rest (n, 3) [mm] of the organ's surface that are now nearest to points (n, 3)."""
-    now, faces = _surface_now(rehearsal)
+    now, faces = _surface_now(anatomy)
     _, face, near = igl.point_mesh_squared_distance(points, now, faces)
     corners = faces[np.atleast_1d(face)]
     share = igl.barycentric_coordinates(np.atleast_2d(near), *(now[corners[:, k]] for k in range(3)))
-    return np.einsum("nk,nka->na", share, np.asarray(rehearsal.organ.vertices)[corners])
+    return np.einsum("nk,nka->na", share, np.asarray(anatomy.organ.vertices)[corners])
 
 
-def _surface_now(rehearsal: Rehearsal) -> tuple[np.ndarray, np.ndarray]:
-    return array_of(rehearsal.organ_skin.vertices).astype(float), np.asarray(rehearsal.organ.faces, np.int64)
+def _surface_now(anatomy: DeformedAnatomy) -> tuple[np.ndarray, np.ndarray]:
+    return anatomy.vertices, np.asarray(anatomy.organ.faces, np.int64)
 
 
 def distance_to_tumour(line: ScoreLine | None, tumour: trimesh.Trimesh | None) -> np.ndarray:

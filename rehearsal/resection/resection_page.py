@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from rehearsal.rehearsal import Rehearsal
+from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.resection.cut import Cut
 from rehearsal.resection.judgement import MARGIN_LIMITS_MM, NOT_LABELLED, Judgement, drawn_mm, shown
 from rehearsal.resection.operation import distance_to_tumour, seen_share
@@ -57,19 +57,19 @@ def figures_of(
     )
 
 
-def report_of(rehearsal: Rehearsal, plan: ResectionPlan | None = None) -> dict[str, Any]:
+def report_of(anatomy: DeformedAnatomy, plan: ResectionPlan | None = None) -> dict[str, Any]:
     """The figures of a cut, how it was made, and its comparison with a plan, for ``report.json``. Raises ResectionError without a cut."""
-    cut, judgement, tumour = rehearsal.cut, rehearsal.judgement, rehearsal.whole_tumour
+    cut, judgement, tumour = anatomy.cut, anatomy.judgement, anatomy.case.tumour
     if cut is None or judgement is None or tumour is None:
         raise ResectionError(NOTHING_CUT)
-    seen_percent = round(100 * seen_share(rehearsal), 1)
+    seen_percent = round(100 * seen_share(anatomy), 1)
     compared = {} if plan is None else dict(against_plan=plan.compared(judgement))
     return figures_of(cut, judgement, tumour, seen_percent) | compared
 
 
-def save_page(rehearsal: Rehearsal, report: dict[str, Any], out: Path) -> list[Path]:
+def save_page(anatomy: DeformedAnatomy, report: dict[str, Any], out: Path) -> list[Path]:
     """Write ``resection.png`` and ``resection.json`` with a report into a folder; return them. Raises ResectionError, OSError."""
-    cut, judgement, tumour = rehearsal.cut, rehearsal.judgement, rehearsal.whole_tumour
+    cut, judgement, tumour = anatomy.cut, anatomy.judgement, anatomy.case.tumour
     if cut is None or judgement is None or tumour is None:
         raise ResectionError(NOTHING_CUT)
     page, figures = out / f"{NAME}.png", out / f"{NAME}.json"

@@ -2,19 +2,17 @@
 
 from pathlib import Path
 
-from rehearsal.rehearsal import Rehearsal
+from rehearsal.case import Case
+from rehearsal.resection.score_line import ScoreLine
 from rehearsal.result_files import write_json
 
 NAME = "score.mrk.json"
 SCHEMA = "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/markups-schema-v1.0.3.json#"
 
 
-def save_score(rehearsal: Rehearsal, out: Path, prefix: str = "") -> Path | None:
-    """Write the score in the patient at rest (the CT); return the file, None where there is no score. Raises OSError."""
-    line = rehearsal.score
-    if line is None:
-        return None
-    points = (line.points + rehearsal.origin).round(4).tolist()
+def save_score(case: Case, line: ScoreLine, out: Path, prefix: str = "") -> Path:
+    """Write a score in the patient at rest (the CT); return the file. Raises OSError."""
+    points = (line.points + case.origin).round(4).tolist()
     curve = dict(
         type="ClosedCurve",
         coordinateSystem="LPS",

@@ -48,6 +48,6 @@ class ResectionScript:
         """Whether there is an action at or before a time [s]."""
         return bool(self._actions) and self._actions[0].time_s <= time_s + 1e-9
 
-    def take(self) -> ScriptedAction:
+    def next(self) -> ScriptedAction:
         """The next action, which is no longer there afterwards."""
         return self._actions.popleft()

@@ -14,13 +14,14 @@ import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, with_config
 from typing_extensions import TypedDict
 
-from rehearsal.rehearsal import RehearsalState
+from rehearsal.loop.command import LEAST_STEP_S, MOST_STEP_S
+from rehearsal.loop.state import WholeState
+from rehearsal.pressed_organ import OrganState
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.resection_state import MOST_MARKS, CutRequest, Resection
 from sim.body import BodyState
 from sim.divergence_check import FARTHEST_MM, DivergenceState
 from sim.solver import SolverState
-from ultrasound.probe_manipulator import ManipulatorState
 
 # Of a pose, all but its last row.
 NUMBERS = 12
@@ -28,9 +29,6 @@ NUMBERS = 12
 COMPONENTS = 6
 # A second has fewer steps; a grid of 1.5 mm over half a metre fewer voxels; all arrays of a body of a million particles fewer bytes.
 MOST_STEPS, MOST_VOXELS, MOST_BYTES = 1_000_000, 100_000_000, 1 << 30
-
-# The range of StepSettings.
-LEAST_STEP_S, MOST_STEP_S = 1e-6, 10.0
 
 # What NumPy and zipfile raise for unreadable data.
 UNREADABLE = (
@@ -71,21 +69,18 @@ def _unpacked(text: str, most: int) -> bytes:
     return content
 
 
-def pack_poses(poses: list[np.ndarray | None]) -> str:
-    """Poses (4, 4), or None for a rollback."""
-    rows = np.full((len(poses), NUMBERS), np.nan)
-    for row, pose in zip(rows, poses, strict=True):
-        if pose is not None:
-            row[:] = np.asarray(pose, float)[:3].ravel()
+def pack_poses(poses: list[np.ndarray]) -> str:
+    """Poses (4, 4)."""
+    rows = np.array([np.asarray(pose, float)[:3].ravel() for pose in poses])
     return _packed(rows.astype("<f8"))
 
 
 def unpack_poses(text: str) -> np.ndarray:
-    """Poses (n, 4, 4), NaN for a rollback. Raises ValueError."""
+    """Poses (n, 4, 4). Raises ValueError."""
     rows = np.frombuffer(_unpacked(text, MOST_STEPS * NUMBERS * 8), "<f8").reshape(-1, NUMBERS)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows.reshape(-1, 3, 4)
-    if np.isinf(poses).any():
+    if not np.isfinite(poses).all():
         raise ValueError("a pose that is not finite")
     return poses
 
@@ -146,17 +141,16 @@ def _unpackable(packed: SeenVoxels) -> SeenVoxels:
 Seen = Annotated[SeenVoxels, AfterValidator(_unpackable)]
 
 
-def pack_state(state: RehearsalState) -> str:
-    """A whole state."""
-    watch = state.divergence
-    now, good = _of_solver("now", state.solver), _of_solver("good", watch.good)
+def pack_state(state: WholeState) -> str:
+    """A whole state, without its manipulator."""
+    organ, check = state.organ, state.organ.divergence
+    now, good = _of_solver("now", organ.solver), _of_solver("good", check.good)
     arrays: dict[str, Any] = {
         **now,
         **({} if all(map(np.array_equal, now.values(), good.values())) else good),
-        "pose": state.pose,
-        **{f"grip.{name}": value for name, value in asdict(state.manipulator).items() if value is not None},
-        "since_good_s": watch.since_good_s,
-        "numbers": [state.steps, watch.steps_since_good, watch.steps_tangled, watch.is_restored],
+        "pose": organ.pose,
+        "since_good_s": check.since_good_s,
+        "numbers": [organ.steps, check.steps_since_good, check.steps_tangled, check.is_restored],
         **_of_resection(state.resection),
     }
     packed = io.BytesIO()
@@ -164,33 +158,26 @@ def pack_state(state: RehearsalState) -> str:
     return _as_text(packed.getvalue())
 
 
-def unpack_state(text: str, like: RehearsalState) -> RehearsalState:
-    """A state of the same body as ``like``. Raises StateError."""
+def unpack_state(text: str, positions: np.ndarray) -> WholeState:
+    """A state of the body that has positions (n, 3) [mm]. Raises StateError."""
     try:
         packed = zipfile.ZipFile(io.BytesIO(base64.b64decode(text, validate=True)))
         if sum(member.file_size for member in packed.infolist()) > MOST_BYTES:
             raise StateError("a state that is too large")
         arrays = dict(np.load(io.BytesIO(packed.fp.getvalue()), allow_pickle=False))  # type: ignore[union-attr]
-        now = _solver(arrays, "now", like.solver)
+        now = _solver(arrays, "now", positions)
         steps, since_good, tangled, restored = map(int, arrays["numbers"])
-        good = _solver(arrays, "good", like.solver) if "good.position" in arrays else now
-        # Not in older sessions.
-        since_good_s = float(arrays.get("since_good_s", 0.0))
+        good = _solver(arrays, "good", positions) if "good.position" in arrays else now
+        since_good_s = float(arrays["since_good_s"])
         if not np.isfinite(since_good_s):
             raise StateError("a time that is not finite")
-        watch = DivergenceState(good, since_good, tangled, bool(restored), since_good_s)
-        turn = tuple(map(float, arrays["grip.turn_deg"].reshape(3)))
-        depth, pressed = float(arrays["grip.depth_mm"]), float(arrays["grip.pressed_mm"])
-        aim = _pose(arrays, "grip.aim") if "grip.aim" in arrays else None
-        if not np.isfinite([*turn, depth, pressed]).all():
-            raise StateError("a manipulator that is not finite")
-        grip = ManipulatorState(depth, pressed, turn, aim)  # type: ignore[arg-type]
+        check = DivergenceState(good, since_good, tangled, bool(restored), since_good_s)
         pose = _pose(arrays, "pose")
-        resection = _resection(arrays, like.solver.body.position.shape)
+        resection = _resection(arrays, positions.shape)
     except UNREADABLE as error:
         what = str(error) or "damaged"
         raise StateError(f"a state that cannot be used ({what.splitlines()[0]})") from None
-    return RehearsalState(now, watch, pose, steps, grip, resection)
+    return WholeState(OrganState(now, check, pose, steps), resection)
 
 
 def _of_resection(resection: Resection) -> dict[str, Any]:
@@ -236,12 +223,11 @@ def _of_solver(name: str, state: SolverState) -> dict[str, np.ndarray]:
     return {f"{name}.position": state.body.position, f"{name}.velocity": state.body.velocity} | contacts
 
 
-def _solver(arrays: dict[str, np.ndarray], name: str, like: SolverState) -> SolverState:
-    def taken(key: str, model: np.ndarray) -> np.ndarray:
-        values = arrays[f"{name}.{key}"]
-        if values.shape != model.shape or values.dtype != model.dtype:
-            raise StateError(f"{key} of {values.dtype} {values.shape}: expected {model.dtype} {model.shape}")
-        return values
-
-    body = BodyState(taken("position", like.body.position), taken("velocity", like.body.velocity))
-    return SolverState(body, {key: taken(f"contacts.{key}", old) for key, old in like.history.items()})
+def _solver(arrays: dict[str, np.ndarray], name: str, positions: np.ndarray) -> SolverState:
+    body = [arrays[f"{name}.{key}"] for key in ("position", "velocity")]
+    for values in body:
+        if values.shape != positions.shape or values.dtype != np.float32 or not np.isfinite(values).all():
+            raise StateError(f"{values.dtype} {values.shape}: expected finite float32 {positions.shape}")
+    begin = f"{name}.contacts."
+    history = {key.removeprefix(begin): values for key, values in arrays.items() if key.startswith(begin)}
+    return SolverState(BodyState(*body), history)

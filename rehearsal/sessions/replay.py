@@ -1,207 +1,220 @@
-"""Replay a recorded session, bit for bit."""
+"""Replay a recorded session, bit for bit: a source of its commands, and an observer that compares the tissue."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
+import click
 import numpy as np
+from tqdm import tqdm
 
-from rehearsal.rehearsal import Rehearsal, RehearsalState
-from rehearsal.resection.operation import repeat_cut, repeat_marks
-from rehearsal.resection.score_line import ResectionError
+from rehearsal.deformed_anatomy import DeformedAnatomy
+from rehearsal.loop.command import Bookmark, Command, Load, Move, SetValues
+from rehearsal.loop.frame import Digest, Frame, Refused
+from rehearsal.loop.history import History
+from rehearsal.loop.observer import Observer
+from rehearsal.loop.state import WholeState
+from rehearsal.loop.stepper import Stepper
+from rehearsal.loop.timeline import SETTLED
+from rehearsal.measurements.live_measurements import LiveMeasurements
+from rehearsal.notices import Notices
 from rehearsal.sessions.packed_arrays import StateError, unpack_state
-from rehearsal.sessions.session import SETTLED, Session
-from rehearsal.sessions.session_file import Log, SessionError
+from rehearsal.sessions.session_file import Log, SessionError, history_after
+from rehearsal.settings import probe_with_settings, set_settings
+from render.viewer import Controls, Settings
+from ultrasound.probe import Probe
 
 # Times are sums of steps.
 ROUNDING_S = 1e-9
-# Events that change the tissue, or the solver's settings.
-CHANGING = ("solver", "back", "state", "marks", "cut")
+# A replay that is further behind the clock than this goes on from there.
+MOST_DUE_S = 0.25
 
 
 class Replay:
-    """Repeat a log on a rehearsal. ``differs_s`` is the time [s] at which the tissue first differed from the recorded one, if it did;
-    ``state`` is its digest at the last comparison; ``bookmarks`` counts those set so far.
+    """A ``Source``: the commands of a log in real time, or ``one_by_one``, with a move for each frame.
 
-    Raises SessionError if the log's states belong to another body.
+    ``place`` is the index of the next command. Raises SessionError where the log's states belong to another body.
     """
 
-    def __init__(self, rehearsal: Rehearsal, log: Log) -> None:
-        self.rehearsal, self.log = rehearsal, log
-        self.session = Session(rehearsal)
-        self.compared = self.bookmarks = 0
-        self.state = ""
-        self.differs_s: float | None = None
-        backs = [
-            (index, event.value) for index, e in log.events.items() for event in e if event.kind == "back"
-        ]
-        if not all(isinstance(to, int) and SETTLED <= to <= index for index, to in backs):
-            raise SessionError("the session restores a step that had not been made: its file is damaged")
-        if {index for index, _ in backs} != set(np.flatnonzero(np.isnan(log.poses).any(axis=(1, 2)))):
-            raise SessionError("the session has a step without a pose: its file is damaged")
-        self._backs = backs
-        changing = {i for i, e in log.events.items() if any(event.kind in CHANGING for event in e)}
-        # Steps before which something else than a step happens.
-        self._stops = changing | set(log.digests) | {to for _, to in backs if isinstance(to, int)}
-        if log.header.begins is not None:
-            rehearsal.restore(self._state(log.header.begins))
+    def __init__(self, log: Log, one_by_one: bool = False) -> None:
+        self.log, self._one_by_one = log, one_by_one
+        self._ends_s = log.ends_s
+        self.place = 0
+        self.bookmarks = 0
+        self._due_s = 0.0
 
     @property
     def is_over(self) -> bool:
-        """Whether all steps have been made."""
-        return self.session.step_index >= len(self.log.poses)
+        """Whether all commands were given."""
+        return self.place >= len(self.log.commands)
 
     @property
     def time_s(self) -> float:
-        """Simulated time since the session began."""
-        return self.session.time_s
+        """Simulated time [s] of the commands that were given."""
+        return float(self._ends_s[self.place - 1]) if self.place else 0.0
 
-    def begin_at(self, seconds: float) -> int:
-        """Restore the last recorded state before a time [s] from which the rest can be replayed; return its step."""
-        aim = self.log.step_at(seconds)
-        start = max((index for index in self.log.states if index <= aim and self._holds(index)), default=0)
-        if start > 0:
-            for index in range(start):
-                self._set(index, operates=False)
-            self.rehearsal.restore(self._state(self.log.states[start]))
-            self.session.step_index, self.session.time_s = start, float(self.log.lengths_s[:start].sum())
-        self.rehearsal.update_surfaces()
-        return start
+    @property
+    def status(self) -> str:
+        """As ``Source.status``."""
+        return f"REPLAY   {self.time_s:.1f} s   {{take_over}} takes control"
 
-    def go_to(self, seconds: float) -> Iterator[tuple[np.ndarray | None, dict[str, Any]]]:
-        """Continue to a time [s] and yield what ``move`` returned for each step. The drawn surfaces are not updated."""
-        aim = self.log.step_at(seconds)
-        while self.session.step_index < aim:
-            pose, settings = self.move()
-            if pose is not None:
-                self.rehearsal.advance(pose)
-                self.end_step()
-            yield pose, settings
+    def begin(self, positions: np.ndarray, seconds: float = 0.0) -> Iterator[Command]:
+        """The commands that restore the last recorded state before a time [s] from which the rest can be replayed.
 
-    def move(self) -> tuple[np.ndarray | None, dict[str, Any]]:
-        """Return the pose to step to, None for a rollback, and the settings of the images that changed; set the step's length.
-
-        Call ``end_step`` after the step. Raises SessionError at the end of the log.
+        ``positions`` (n, 3) are those of the body. Raises SessionError.
         """
-        index = self.session.step_index
-        if self.is_over:
-            raise SessionError("the session is over")
-        back, settings = self._set(index)
-        self.rehearsal.settings.time_step_s = float(self.log.lengths_s[index])
-        self._keep_if_needed(index)
-        if back is not None:
-            if back not in self.session.kept_states:
-                self.session.kept_states[back] = self._state(self.log.states[back])
-            self.session.roll_back(back)
-            self._compare()
-            return None, settings
-        return self.log.poses[index], settings
-
-    def next_steps(self, most_s: float) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
-        """Poses (n, 4, 4) and lengths (n,) [s] of the next steps, and the settings of the images that change in them.
-
-        They last about a time [s], and at most until something else happens than a step. A rollback, which is done here, has a length
-        and no pose. Raises SessionError at the end of the log.
-        """
-        first = last = self.session.step_index
-        pose, settings = self.move()
-        lengths_s = self.log.lengths_s
-        if pose is None:
-            return self.log.poses[:0], lengths_s[first : first + 1], settings
-        last += 1
-        while last < len(self.log.poses) and last not in self._stops:
-            if lengths_s[first : last + 1].sum() > most_s + ROUNDING_S:
-                break
-            settings |= self._set(last)[1]
-            last += 1
-        return self.log.poses[first:last], lengths_s[first:last], settings
-
-    def end_step(
-        self, pose: np.ndarray | None = None, length_s: float | None = None, wrench: np.ndarray | None = None
-    ) -> None:
-        """Count a step that was made; left out, pose and length are the rehearsal's present ones."""
-        self.session.end_step(pose, length_s, wrench)
-        self._compare()
-
-    def _set(self, index: int, operates: bool = True) -> tuple[int | None, dict[str, Any]]:
-        """Set solver and tissue as at a step; return the step that it restores, if any, and its settings of the images.
-
-        A recorded state holds marks and cut: before one is restored they are not to be made (``operates``).
-        """
-        back: int | None = None
-        settings: dict[str, Any] = {}
-        for event in self.log.events.get(index, []):
-            if event.kind in ("marks", "cut") and operates:
-                # Undo restores the state before them.
-                self._keep_if_needed(index)
-                self._operate(event.kind, event.value)
-            if event.kind == "solver":
-                set_solver(self.rehearsal, event.value)
-            elif event.kind == "settings":
-                settings |= event.value
-            elif event.kind == "back":
-                back = event.value
-            elif event.kind == "state":
-                self.rehearsal.store_valid_state()
-            elif event.kind == "bookmark":
-                self.bookmarks += 1
-        return back, settings
-
-    def _keep_if_needed(self, index: int) -> None:
-        """Keep the present state if a later rollback restores it."""
-        if self.session.step_index == index and any(to == index for _, to in self._backs):
-            self.session.keep_state()
-
-    def _operate(self, kind: str, value: Any) -> None:
-        """Set the recorded marks, or cut. Raises SessionError."""
-        try:
-            if kind == "marks":
-                repeat_marks(self.rehearsal, value)
-            else:
-                repeat_cut(self.rehearsal, value)
-        except (ResectionError, ValueError) as error:
-            raise SessionError(f"the session's {kind} cannot be repeated: {error}") from None
-
-    def settings_until_now(self) -> dict[str, Any]:
-        """The settings of the images at the present step."""
-        settings: dict[str, Any] = {}
-        for index in sorted(m for m in self.log.events if m <= self.session.step_index):
-            for event in self.log.events[index]:
-                settings |= event.value if event.kind == "settings" else {}
-        return settings
-
-    def _compare(self) -> None:
-        digest = self.log.digests.get(self.session.step_index)
-        if digest is None:
+        log = self.log
+        if log.header.begins is not None:
+            yield Load(state=self._state(log.header.begins, positions))
+        self.place, kept = self._start(log.place_at(seconds))
+        if self.place == 0:
             return
-        self.compared += 1
-        self.state = self.rehearsal.digest()
-        if self.differs_s is None and digest != self.state:
-            self.differs_s = self.time_s
-
-    def _holds(self, start: int) -> bool:
-        """Whether no later rollback restores a state from before a step that was not recorded."""
-        return all(
-            index < start or to >= start or to == SETTLED or to in self.log.states
-            for index, to in self._backs
+        history, values = History(), dict[str, Any]()
+        for number, command in log.commands[: self.place]:
+            history, _ = history_after(history, number, command)
+            if isinstance(command, SetValues):
+                values |= command.values
+        number = self._number_at(self.place)
+        yield SetValues(values=values)
+        yield Load(
+            state=self._state(log.states[number], positions),
+            number=number,
+            time_s=self.time_s,
+            history=history,
+            kept={other: self._state(log.states[other], positions) for other in kept},
         )
 
-    def _state(self, text: str) -> RehearsalState:
+    def commands(self, frame: Frame, controls: Controls, elapsed_s: float) -> Iterator[Command]:
+        """As ``Source.commands``: those of a time [s], unless the steps before are not made yet. Raises SessionError."""
+        self.check(frame)
+        if self._one_by_one:
+            yield from self._next(1)
+            return
+        self._due_s = min(self._due_s + elapsed_s, MOST_DUE_S)
+        if self.time_s - frame.time_s > MOST_DUE_S:
+            return
+        until_s = self.time_s + self._due_s
+        while not self.is_over and self.time_s < until_s - ROUNDING_S:
+            before_s = self.time_s
+            yield from self._next(1)
+            self._due_s -= self.time_s - before_s
+
+    def check(self, frame: Frame) -> None:
+        """Raises SessionError where a command of the log was refused."""
+        for event in frame.events:
+            if isinstance(event, Refused):
+                raise SessionError(
+                    f"the session's {event.command.kind} cannot be repeated: {event.reason}; its file is damaged, or of another body"
+                )
+
+    def until(self, seconds: float) -> Iterator[tuple[Command, ...]]:
+        """The commands up to a time [s], as many at a time as there are up to a move."""
+        last = self.log.place_at(seconds)
+        while self.place < last:
+            yield tuple(self._next(1, last))
+
+    def moves_until(self, place: int) -> int:
+        """How many moves there are before the command of a place."""
+        return sum(isinstance(command, Move) for _, command in self.log.commands[self.place : place])
+
+    def _next(self, moves: int, last: int | None = None) -> Iterator[Command]:
+        """The next commands, up to so many moves and what follows the last of them at once."""
+        commands = self.log.commands
+        last = len(commands) if last is None else last
+        while self.place < last:
+            command = commands[self.place][1]
+            if isinstance(command, Move):
+                if moves == 0:
+                    return
+                moves -= 1
+            self.place += 1
+            self.bookmarks += isinstance(command, Bookmark)
+            yield command
+
+    def _number_at(self, place: int) -> int:
+        return self.log.commands[place][0] if place < len(self.log.commands) else self.log.last_number
+
+    def _start(self, most: int) -> tuple[int, set[int]]:
+        """The place at most so far from which the rest can be replayed, and the recorded states before it that the rest restores."""
+        log, restored = self.log, self.log.restored()
+        places = {self._number_at(place): place for place in range(most, -1, -1)}
+        for number in sorted((n for n in log.states if n in places), reverse=True):
+            place = places[number]
+            later = {to for at, to, _ in restored if at >= place and to != SETTLED and to < number}
+            if later <= log.states.keys():
+                return place, later
+        return 0, set()
+
+    def _state(self, text: str, positions: np.ndarray) -> WholeState:
         try:
-            state = unpack_state(text, self.rehearsal.settled)
+            return unpack_state(text, positions)
         except StateError as error:
             raise SessionError(f"the session holds {error}: it is damaged, or of another body") from None
-        bodies = state.solver.body, state.divergence.good.body
-        if not all(np.isfinite(values).all() for body in bodies for values in (body.position, body.velocity)):
-            raise SessionError("the session holds a state of tissue that is not finite: its file is damaged")
-        return state
 
 
-def set_solver(rehearsal: Rehearsal, values: dict[str, Any]) -> None:
-    """Set the recorded values of solver and material."""
-    step = rehearsal.settings
-    for name in ("iterations", "substeps", "stiffness"):
-        setattr(step, name, values.get(name, getattr(step, name)))
-    if "young_kpa" in values:
-        rehearsal.set_young(values["young_kpa"])
-    if "gravity_m_s2" in values:
-        rehearsal.set_gravity(values["gravity_m_s2"])
+class ReplayCheck:
+    """An ``Observer`` that compares a replay with its log, and says once where the tissue differs.
+
+    ``differs_s`` is the time [s] from which on it does, None where it does not; ``digest`` is that of the last comparison, at a time
+    ``compared_s``.
+    """
+
+    def __init__(self, log: Log, notices: Notices) -> None:
+        self.log, self._notices = log, notices
+        self.compared = 0
+        self.compared_s = 0.0
+        self.digest = ""
+        self.differs_s: float | None = None
+        self._is_over = False
+
+    def observe(self, frame: Frame, probe: Probe) -> None:
+        """As ``Observer.observe``, until another session begins."""
+        self._is_over = self._is_over or frame.begins is not None
+        for event in frame.events:
+            if not self._is_over and isinstance(event, Digest) and event.number in self.log.digests:
+                self._compare(event, frame.time_s)
+
+    def _compare(self, event: Digest, time_s: float) -> None:
+        self.compared, self.compared_s, self.digest = self.compared + 1, time_s, event.digest
+        if self.differs_s is None and event.digest != self.log.digests[event.number]:
+            self.differs_s = time_s
+            self._notices.post(
+                f"Warning: from {time_s:.0f} s on the tissue differs from the recorded one.", on_screen=False
+            )
+
+
+def open_session(
+    replay: Replay,
+    at_s: float,
+    stepper: Stepper,
+    anatomy: DeformedAnatomy,
+    settings: Settings,
+    measurements: LiveMeasurements,
+    observers: list[Observer],
+) -> None:
+    """Take a rehearsal to a time [s] of a session: the tissue, the settings, the measurements and the coverage until then.
+
+    Raises SessionError.
+    """
+
+    def apply(commands: Iterable[Command]) -> Frame:
+        for command in commands:
+            if isinstance(command, SetValues):
+                set_settings(settings, command.values)
+            stepper.submit(command)
+        stepper.wait()
+        frame = stepper.newest()
+        replay.check(frame)
+        anatomy.show(frame)
+        anatomy.find_plane(probe_with_settings(anatomy.case.probe, settings))
+        return frame
+
+    frame = apply(replay.begin(anatomy.frame.positions, at_s))
+    begins, aim = frame.number, replay.log.place_at(at_s)
+    if not measurements.recall(replay.log, begins):
+        click.echo(
+            f"Warning: the session has no record of the coverage until {replay.time_s:.0f} s; coverage and summary begin there."
+        )
+    for commands in tqdm(replay.until(at_s), desc=f"to {at_s:g} s", total=aim, unit="step", disable=aim == 0):
+        frame = apply(commands)
+        for observer in observers:
+            observer.observe(frame, probe_with_settings(anatomy.case.probe, settings))

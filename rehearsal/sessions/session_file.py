@@ -1,36 +1,42 @@
-"""The file of a session: one line of JSON a second, each on the disk when it is written, so that a crash costs a second at most.
+"""The file of a session: a line of JSON for each command, with the number of the state that it was applied to.
 
-The first line names what is rehearsed; each other line is a second: events, the transducer's poses, and the tissue's digest after
-it. Once a minute and at the end a line has the whole state and the coverage; the last line has the summary. No line names a patient or a path.
+The first line names what is rehearsed. Moves are packed, those of a second or up to the next command in a line. Beside them are hashes of
+the tissue, whole states with the coverage, measurements, and in the last line the summary. Each line is on the disk when it is written, so
+that a crash costs a second at most. No line names a patient or a path.
 """
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
-from typing_extensions import TypedDict
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from errors import FOUND, UserError, explained
-from rehearsal.resection.resection_state import MOST_MARKS
-from rehearsal.sessions.packed_arrays import (
+from rehearsal.loop.command import (
     LEAST_STEP_S,
     MOST_STEP_S,
-    Seen,
-    SeenVoxels,
-    unpack_lengths,
-    unpack_poses,
+    BeginAction,
+    Bookmark,
+    CutOut,
+    GoTo,
+    Mark,
+    Move,
+    Recorded,
+    Redo,
+    Reset,
+    Undo,
+    are_rigid,
 )
-from render.viewer import Technique
+from rehearsal.loop.history import History
+from rehearsal.loop.timeline import SETTLED
+from rehearsal.sessions.packed_arrays import Seen, SeenVoxels, unpack_lengths, unpack_poses
 from scenes.scene import Scene
 from text_files import TextError, json_value
-from ultrasound.crater import Filling
-from version import FORMAT, of_this_format
 
+# The format of a session's file. The first had events between the poses of seconds.
+SESSION_FORMAT = 3
 MOST_FILE_BYTES = 2_000_000_000
-# Of a pose: how far its axes are from right angles, and its place from the origin [mm].
-RIGID, MOST_MM = 1e-3, 1e4
 # The parts of a scene that belong to the patient's folder and may name files.
 PATIENTS: dict[str, Any] = {
     **{"anatomy": True, "shape": True, "title": True, "uncertainty": True},
@@ -51,7 +57,7 @@ class _Line(BaseModel):
 class Header(_Line):
     """What is rehearsed, by which version of Nephron. ``anatomy`` is the fingerprint of the scene's files."""
 
-    nephron_session: int = FORMAT
+    nephron_session: int = SESSION_FORMAT
     version: str | None = Field(None, pattern=r"^[0-9A-Za-z.+-]{1,40}$")
     anatomy: str
     scene: dict[str, Any]
@@ -66,103 +72,143 @@ class Header(_Line):
     @model_validator(mode="before")
     @classmethod
     def _has_this_format(cls, values: Any) -> Any:
-        return of_this_format(values, "nephron_session")
+        found = values.get("nephron_session") if isinstance(values, dict) else None
+        if isinstance(found, int) and 0 < found < SESSION_FORMAT:
+            raise ValueError(
+                f"nephron_session = {found}: recorded by Nephron {found}, which replays it; record the session anew with this one"
+            )
+        if found is not None and found != SESSION_FORMAT:
+            raise ValueError(f"nephron_session = {FOUND.repr(found)}: expected {SESSION_FORMAT}")
+        return values
 
 
-class SolverValues(TypedDict, total=False):
-    """Settings of a step; what is left out stays unchanged."""
-
-    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)  # type: ignore[misc]
-    iterations: Annotated[int, Field(ge=1, le=1000)]
-    substeps: Annotated[int, Field(ge=1, le=100)]
-    stiffness: Annotated[float, Field(ge=0, le=1)]
-    young_kpa: Annotated[float, Field(gt=0, le=1e6)]
-    gravity_m_s2: Annotated[float, Field(ge=0, le=100)]
-
-
-class RecordedCut(TypedDict):
-    """A cut along the score: see ``CutSettings``; ``seen`` has a bit for each vertex of the tumour's surface, as base64."""
-
-    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)  # type: ignore[misc]
-    technique: Technique
-    margin_mm: Annotated[float, Field(ge=0, le=100)]
-    depth_mm: Annotated[float, Field(gt=0, le=500)] | None
-    filling: Filling
-    seen: Annotated[str, Field(pattern=r"^[A-Za-z0-9+/]*={0,2}$", max_length=1_000_000)]
-
-
-Place = Annotated[list[Annotated[float, Field(ge=-1e4, le=1e4)]], Field(min_length=3, max_length=3)]
-# What the value of each kind of event is.
-VALUES: dict[str, TypeAdapter] = {
-    "settings": TypeAdapter(dict[str, bool | int | float | str | None]),
-    "solver": TypeAdapter(SolverValues),
-    "back": TypeAdapter(int),
-    "bookmark": TypeAdapter(int),
-    "marks": TypeAdapter(Annotated[list[Place], Field(max_length=MOST_MARKS)]),
-    "cut": TypeAdapter(RecordedCut),
-    "reading": TypeAdapter(dict[str, float | None]),
-    "state": TypeAdapter(str),
-    "seen": TypeAdapter(Seen),
-}
-Kind = Literal["settings", "solver", "back", "bookmark", "marks", "cut", "reading", "state", "seen"]
-
-
-class Event(_Line):
-    """Something that happened before step ``at``."""
+class CommandLine(_Line):
+    """A command that was applied to the state of a number."""
 
     at: int = Field(ge=0)
-    kind: Kind
-    value: Any
-
-    @model_validator(mode="after")
-    def _of_its_kind(self) -> "Event":
-        VALUES[self.kind].validate_python(self.value, strict=True)
-        return self
+    command: Annotated[Recorded, Field(discriminator="kind", strict=False)]
 
 
-class Second(_Line):
-    """Steps from ``at`` on: their poses, packed; the tissue's digest after the last one."""
+class MovesLine(_Line):
+    """Moves from the state of a number on, packed: poses, lengths where one is not the header's, and wrenches (force [N] of the tissue on
+    the probe, torque [N mm] about the centre of the array face, LPS).
+    """
 
     at: int = Field(ge=0)
-    poses: str
+    moves: str
     lengths_s: str | None = None
-    """The steps' lengths, packed, where one is not the header's."""
     wrenches: str | None = None
-    """Force [N] of the tissue on the probe, and its torque [N mm] about the centre of the array face, of each step (LPS), packed."""
-    events: list[Event] = Field(default_factory=list)
+
+
+class DigestLine(_Line):
+    """A hash of the tissue in the state of a number."""
+
+    at: int = Field(ge=0)
     digest: str
 
 
-class End(_Line):
-    """The summary of a session that ended in order, its final state, and the coverage so far."""
+class StateLine(_Line):
+    """The whole state of a number, and the coverage until then."""
 
-    summary: dict[str, Any]
+    at: int = Field(ge=0)
     state: str
     seen: Seen | None = None
 
 
+class ReadingLine(_Line):
+    """Measurements in the state of a number."""
+
+    at: int = Field(ge=0)
+    reading: dict[str, float | None]
+
+
+class EndLine(_Line):
+    """The summary of a session that ended in order."""
+
+    summary: dict[str, Any]
+
+
+# The kind of a line is told by its key.
+LINES: dict[str, type[_Line]] = dict(
+    command=CommandLine,
+    moves=MovesLine,
+    digest=DigestLine,
+    state=StateLine,
+    reading=ReadingLine,
+    summary=EndLine,
+)
+
+
 @dataclass
 class Log:
-    """A session as read: ``poses`` (steps, 4, 4), NaN for a rollback, and ``lengths_s`` (steps,); the rest by step index."""
+    """A session as read: its ``commands`` in their order, each with the number of the state that it was applied to; the rest by number."""
 
     header: Header
-    poses: np.ndarray
-    lengths_s: np.ndarray
-    events: dict[int, list[Event]] = field(default_factory=dict)
+    commands: list[tuple[int, Recorded | Move]] = field(default_factory=list)
     digests: dict[int, str] = field(default_factory=dict)
     states: dict[int, str] = field(default_factory=dict)
     seen: dict[int, SeenVoxels] = field(default_factory=dict)
+    readings: dict[int, dict[str, float | None]] = field(default_factory=dict)
     summary: dict[str, Any] | None = None
+    last_number: int = 0
+
+    @property
+    def steps(self) -> int:
+        """The number of moves."""
+        return sum(isinstance(command, Move) for _, command in self.commands)
 
     @property
     def length_s(self) -> float:
         """Simulated time."""
-        return float(self.lengths_s.sum())
+        return float(self.ends_s[-1]) if self.commands else 0.0
 
-    def step_at(self, seconds: float) -> int:
-        """The number of steps whose end is nearest to a time [s]."""
-        ends = np.concatenate([[0.0], np.cumsum(self.lengths_s)])
-        return int(np.argmin(np.abs(ends - seconds)))
+    @property
+    def ends_s(self) -> np.ndarray:
+        """The simulated time (n,) [s] after each command."""
+        lengths = [
+            (command.length_s or self.header.time_step_s) if isinstance(command, Move) else 0.0
+            for _, command in self.commands
+        ]
+        return np.cumsum(lengths)
+
+    def place_at(self, seconds: float) -> int:
+        """How many commands come before a time [s]: up to the move whose end is nearest to it, and what follows it at once."""
+        ends = np.concatenate([[0.0], self.ends_s])
+        nearest = ends[int(np.argmin(np.abs(ends - seconds)))]
+        return int(np.searchsorted(self.ends_s, nearest + 1e-9, side="right")) if self.commands else 0
+
+    def restored(self) -> list[tuple[int, int, History]]:
+        """For each command that restores a state its place, the number of that state, and the history before it."""
+        found, history = [], History()
+        for place, (number, command) in enumerate(self.commands):
+            after, to = history_after(history, number, command)
+            if to is not None:
+                found.append((place, to, history))
+            history = after
+        return found
+
+
+def history_after(history: History, number: int, command: Recorded | Move) -> tuple[History, int | None]:
+    """The history after a command that was applied to the state of a number, and the number of the state that it restored."""
+    match command:
+        case BeginAction() | Mark() | CutOut():
+            return history.begun(number), None
+        case Bookmark():
+            return history.marked(number), None
+        case Undo():
+            return history.undo(number)
+        case Redo():
+            return history.redo(number)
+        case Reset():
+            return history.begun(number), SETTLED
+        case GoTo():
+            return history.begun(number), command.state
+    return history, None
+
+
+def makes_state(command: Recorded | Move) -> bool:
+    """Whether the tissue has another state after a command."""
+    return isinstance(command, Move | Mark | CutOut | Undo | Redo | Reset | GoTo)
 
 
 def read_log(path: Path) -> Log:
@@ -178,64 +224,76 @@ def read_log(path: Path) -> Log:
         raise SessionError(f"{path}: no such session file") from None
     except OSError as error:
         raise SessionError(f"{name}: cannot be read as a session ({error.strerror})") from None
-    header = _header(name, lines[0])
-    log = Log(header, np.zeros((0, 4, 4)), np.zeros(0))
-    parts: list[np.ndarray] = []
-    lengths: list[np.ndarray] = []
+    log, number = Log(_header(name, lines[0])), 0
     # A last line without its end was being written when the session was cut off.
-    for number, line in enumerate(lines[1:-1], 2):
-        second = _line_of(name, number, line)
-        steps = sum(len(part) for part in parts)
-        if isinstance(second, End):
-            log.summary = second.summary
-            log.states[steps] = second.state
-            if second.seen is not None:
-                log.seen[steps] = second.seen
+    for count, text in enumerate(lines[1:-1], 2):
+        line = _line_of(name, count, text)
+        if isinstance(line, EndLine):
+            log.summary = line.summary
             break
         try:
-            poses = unpack_poses(second.poses)
-            lengths_s = _lengths_of(second, len(poses), header.time_step_s)
-        except ValueError:
-            poses = np.zeros((0, 4, 4))
-        if second.at != steps or len(poses) == 0:
+            number = _add(log, line, number)
+        except ValueError as error:
             raise SessionError(
-                f"{name}: line {number} does not follow the line before it: one is missing or damaged"
-            )
-        if not _are_rigid(poses):
-            raise SessionError(
-                f"{name}: line {number} has a pose that is none of a probe: expected right-angled axes of length 1, and a place within "
-                f"{MOST_MM:g} mm; what comes before it can be had by deleting from it on"
-            )
-        parts.append(poses)
-        lengths.append(lengths_s)
-        for event in second.events:
-            if event.kind == "state":
-                log.states[event.at] = event.value
-            elif event.kind == "seen":
-                log.seen[event.at] = event.value
-            log.events.setdefault(event.at, []).append(event)
-        log.digests[steps + len(poses)] = second.digest
-    log.poses = np.concatenate([log.poses, *parts])
-    log.lengths_s = np.concatenate([log.lengths_s, *lengths])
+                f"{name}: line {count} {error}; what comes before it can be had by deleting from it on"
+            ) from None
+    log.last_number = number
+    _check_history(name, log)
     return log
 
 
-def _are_rigid(poses: np.ndarray) -> bool:
-    """Whether poses (n, 4, 4), NaN for a rollback, are rotations with a translation."""
-    poses = poses[~np.isnan(poses).any(axis=(1, 2))]
-    axes, places = poses[:, :3, :3], poses[:, :3, 3]
-    off = np.abs(axes.transpose(0, 2, 1) @ axes - np.eye(3))
-    return not ((off > RIGID).any() or (np.linalg.det(axes) < 0).any() or (np.abs(places) > MOST_MM).any())
+def _add(log: Log, line: _Line, number: int) -> int:
+    """Add a line to a log at the state of a number; return the number after it. Raises ValueError."""
+    match line:
+        case CommandLine():
+            _check_follows(line.at, number)
+            log.commands.append((number, line.command))
+            return number + makes_state(line.command)
+        case MovesLine():
+            _check_follows(line.at, number)
+            return _add_moves(log, line, number)
+        case DigestLine():
+            log.digests[line.at] = line.digest
+        case StateLine():
+            log.states[line.at] = line.state
+            if line.seen is not None:
+                log.seen[line.at] = line.seen
+        case ReadingLine():
+            log.readings[line.at] = line.reading
+    return number
 
 
-def _lengths_of(second: Second, steps: int, usual_s: float) -> np.ndarray:
-    """The lengths (steps,) [s] of a line's steps. Raises ValueError."""
-    if second.lengths_s is None:
-        return np.full(steps, usual_s)
-    lengths_s = unpack_lengths(second.lengths_s)
-    if len(lengths_s) != steps:
-        raise ValueError(f"{len(lengths_s)} lengths of {steps} steps")
-    return lengths_s
+def _add_moves(log: Log, line: MovesLine, number: int) -> int:
+    poses = unpack_poses(line.moves)
+    if not are_rigid(poses) or len(poses) == 0:
+        raise ValueError("has a pose that is none of a probe: expected right-angled axes of length 1")
+    lengths_s = np.full(len(poses), log.header.time_step_s)
+    if line.lengths_s is not None:
+        lengths_s = unpack_lengths(line.lengths_s)
+    if len(lengths_s) != len(poses):
+        raise ValueError(f"has {len(lengths_s)} lengths of {len(poses)} moves")
+    for count, (pose, length_s) in enumerate(zip(poses, lengths_s.tolist(), strict=True)):
+        move = Move.model_construct(kind="move", pose=pose, length_s=length_s)
+        log.commands.append((number + count, move))
+    return number + len(poses)
+
+
+def _check_follows(at: int, number: int) -> None:
+    if at != number:
+        raise ValueError("does not follow the line before it: one is missing or damaged")
+
+
+def _check_history(name: str, log: Log) -> None:
+    """Raises SessionError for a log that restores a state which had not been made."""
+    for place, to, history in log.restored():
+        command = log.commands[place][1]
+        if isinstance(command, GoTo) and to not in history.bookmarks:
+            raise SessionError(f"{name}: it goes to a bookmark that was not set: its file is damaged")
+    history = History()
+    for number, command in log.commands:
+        history, to = history_after(history, number, command)
+        if isinstance(command, Undo | Redo) and to is None:
+            raise SessionError(f"{name}: it restores a state that had not been made: its file is damaged")
 
 
 def _header(name: str, line: bytes) -> Header:
@@ -248,15 +306,15 @@ def _header(name: str, line: bytes) -> Header:
         ) from None
 
 
-def _line_of(name: str, number: int, line: bytes) -> Second | End:
+def _line_of(name: str, count: int, text: bytes) -> _Line:
     try:
-        values = json_value(line)
-        is_end = isinstance(values, dict) and "summary" in values
-        return End.model_validate(values) if is_end else Second.model_validate(values)
+        values = json_value(text)
+        kind = next((key for key in LINES if isinstance(values, dict) and key in values), "command")
+        return LINES[kind].model_validate(values)
     except (ValidationError, TextError) as error:
         what = explained(error) if isinstance(error, ValidationError) else error
         raise SessionError(
-            f"{name}: line {number} is damaged ({what}); what comes before it can be had by deleting from it on"
+            f"{name}: line {count} is damaged ({what}); what comes before it can be had by deleting from it on"
         ) from None
 
 

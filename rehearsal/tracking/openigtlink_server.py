@@ -20,8 +20,7 @@ from pyigtl import ImageMessage, StringMessage, TransformMessage
 from pyigtl.messages import CRC64, MessageBase
 from scipy.linalg import polar
 
-from rehearsal.coordinates import probe_in_patient
-from rehearsal.rehearsal import Rehearsal
+from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.tracking.pose_file import is_rigid
 from render.viewer import View
 from ultrasound.probe import Probe
@@ -257,14 +256,13 @@ def _without_rests(header: bytes) -> bytes:
     return bytes(cleared)
 
 
-def send_live(
-    link: OpenIGTLinkServer | None, rehearsal: Rehearsal, view: View, probe: Probe, time_s: float
-) -> None:
-    """Send the first image of a view, if there is a link."""
+def send_live(link: OpenIGTLinkServer | None, anatomy: DeformedAnatomy, view: View, probe: Probe) -> None:
+    """Send the first image of a view of an anatomy as it is shown, if there is a link."""
     if link is not None:
         grey = next(iter(view.images.values()))
         image_to_probe = probe.image_to_probe(*grey.shape)
-        link.send(grey, image_to_probe, probe_in_patient(rehearsal), time_s, rehearsal.wrench())
+        frame = anatomy.frame
+        link.send(grey, image_to_probe, anatomy.probe_in_patient(), frame.time_s, frame.wrench)
 
 
 def force_text(wrench: np.ndarray) -> str:

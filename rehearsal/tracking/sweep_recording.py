@@ -2,9 +2,8 @@
 
 from pathlib import Path
 
-from rehearsal.coordinates import probe_in_patient
+from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.notices import Notices
-from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import next_number
 from render.viewer import View
 from ultrasound.probe import Probe
@@ -18,8 +17,8 @@ NAME = r"sweep-([0-9]{3,9})\.igs\.mha"
 class SweepRecorder:
     """Records a sweep between two calls of ``toggle``."""
 
-    def __init__(self, rehearsal: Rehearsal, notices: Notices) -> None:
-        self.rehearsal, self.notices = rehearsal, notices
+    def __init__(self, anatomy: DeformedAnatomy, notices: Notices) -> None:
+        self.anatomy, self.notices = anatomy, notices
         self._sweep: LabelledSweep | None = None
         self._began_s = self._due_s = 0.0
         self._image_kind = ""
@@ -29,12 +28,12 @@ class SweepRecorder:
         if self._sweep is not None:
             self.end()
             return
-        if self.rehearsal.scanner is None:
+        if self.anatomy.scanner is None:
             self.notices.post("No sweep: the scene has no CT")
             return
         stem = f"sweep-{next_number(out, NAME):03d}"
         try:
-            self._sweep = LabelledSweep(out, stem, self.rehearsal.probe)
+            self._sweep = LabelledSweep(out, stem, self.anatomy.case.probe)
         except OSError as error:
             self.notices.post(f"{stem} cannot be written: {_reason(error)}")
             return
@@ -57,20 +56,20 @@ class SweepRecorder:
         except (OSError, SweepError) as error:
             self.notices.post(f"No sweep: {_reason(error)}{why}")
 
-    def watch(self, time_s: float, view: View, probe: Probe) -> None:
+    def add(self, time_s: float, view: View, probe: Probe) -> None:
         """Add the current image where a frame is due."""
         kind, image = next(iter(view.images.items()))
         # After the end of a replay another session begins, with its own time; a volume of B-mode and CT images would be neither.
         if time_s < self._due_s - FRAME_S - 1e-9 or (self._image_kind and kind != self._image_kind):
             self.end()
-        if self._sweep is None or time_s < self._due_s - 1e-9 or self.rehearsal.scanner is None:
+        if self._sweep is None or time_s < self._due_s - 1e-9 or self.anatomy.scanner is None:
             return
         if self._sweep.count == 0:
             self._began_s = time_s
         self._due_s, self._image_kind = time_s + FRAME_S, kind
-        labels = self.rehearsal.scanner.ground_truth.render()
+        labels = self.anatomy.scanner.ground_truth.render()
         try:
-            self._sweep.add(image, labels, probe, probe_in_patient(self.rehearsal), time_s)
+            self._sweep.add(image, labels, probe, self.anatomy.probe_in_patient(), time_s)
         except SweepError as error:
             self.end(f": {error}")
         except OSError as error:

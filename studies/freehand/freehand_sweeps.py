@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-
 from rehearsal.coordinates import probe_in_patient
+
 from rehearsal.measurements.tumour_measurements import measure
 from rehearsal.reconstruction.compression_correction import approach
 from rehearsal.rehearsal import Rehearsal, scanned_anatomy

@@ -114,6 +114,7 @@ def doppler() -> Iterator[CaseFigures]:
 def frames() -> Iterator[CaseFigures]:
     """A frame of the window with its picture, off-screen, drawn by the Vulkan driver."""
     from rehearsal.open_window import geometry_of, initial_settings
+
     from rehearsal.opening import compile_picture
     from render.window import Window
 

@@ -10,15 +10,15 @@ import numpy as np
 import taichi as ti
 import trimesh
 from matplotlib.figure import Figure
+from rehearsal.frame import image_view
+from rehearsal.open_window import initial_settings, probe_with_settings
 from taichi.profiler.kernel_profiler import get_default_kernel_profiler
 from tqdm import tqdm
 
 from rehearsal.build_solver import build_solver, embedding_cell_mm, static_shape
 from rehearsal.commands.command_line import arch_option
 from rehearsal.configuration import PRESETS, Setup
-from rehearsal.frame import image_view
 from rehearsal.measurements.run_report import Tally
-from rehearsal.open_window import initial_settings, probe_with_settings
 from rehearsal.pressed_organ import material_of
 from rehearsal.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
 from rehearsal.stopwatch import timed

@@ -31,6 +31,7 @@ from version import VERSION
 
 if TYPE_CHECKING:
     from rehearsal.frame import WindowFrames
+
     from rehearsal.pressed_organ import Step
     from rehearsal.run import RehearsalRun
 

@@ -6,17 +6,17 @@ from typing import Any
 
 import click
 import numpy as np
+from rehearsal.inputs.user_input import UserInput
+from rehearsal.open_window import initial_settings
+from rehearsal.sessions.session import Session
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import arch_option
 from rehearsal.configuration import PRESETS
-from rehearsal.inputs.user_input import UserInput
-from rehearsal.open_window import initial_settings
 from rehearsal.real_time.pace import Pace
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.recorder import record
 from rehearsal.sessions.replay import Replay
-from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import Log, read_log
 from render.viewer import Controls
 from scenes.scene import EMBEDDED

@@ -10,13 +10,14 @@ import pytest
 from coarse_patient import coarse_patient
 from null_viewer import NullViewer
 from plan_ball import plan_of, sweep_of
+from rehearsal.open_window import initial_settings
+from rehearsal.sessions.session import Session
 
 from rehearsal import run
 from rehearsal.asked_files import AskedFiles
 from rehearsal.build_solver import step_settings
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.measurements.live_measurements import LiveMeasurements
-from rehearsal.open_window import initial_settings
 from rehearsal.opening import compile_picture
 from rehearsal.planning.plan_file import Plan
 from rehearsal.real_time.pace import Pace
@@ -25,7 +26,6 @@ from rehearsal.real_time.solver_process import SolverProcess
 from rehearsal.real_time.started_process import start_process
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.replay import Replay
-from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import read_log
 from render.keys import Keys
 from render.viewer import Controls, Settings

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from click.exceptions import Exit
 from null_viewer import NullViewer
+from rehearsal.frame import PREPARING, Frames, WindowFrames
 from test_openigtlink import LiveImage
 
 import app
 from rehearsal import frame, headless, opening, run
 from rehearsal.asked_files import AskedFiles
 from rehearsal.commands.rehearse_options import RehearseOptions
-from rehearsal.frame import PREPARING, Frames, WindowFrames
 from rehearsal.measurements.run_report import Tally
 from rehearsal.notices import Notices
 from rehearsal.pressed_organ import Step

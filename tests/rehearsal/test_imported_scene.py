@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from rehearsal.sessions.session import Session
 from synthetic_body import LEFT, RIGHT, TUMOUR, body, coarsely, drawn
 
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.pressed_organ import PressedOrgan
 from rehearsal.rehearsal import Rehearsal
-from rehearsal.sessions.session import Session
 from scenes.anatomy import load_anatomy
 from scenes.mechanical_tissues import mechanical_properties
 from scenes.patients.part_surfaces import PARTS

@@ -20,8 +20,8 @@ from plan_ball import (
     manipulator_on,
     sweep_of,
 )
-
 from rehearsal.coordinates import probe_in_patient
+
 from rehearsal.planning.pass_kinds import (
     LEAST_COSINE,
     MOST_PASSES,

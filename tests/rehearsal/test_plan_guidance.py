@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from conftest import rotation_about
 from plan_ball import SIZE, over_ball, plan_of, straight_pass, sweep_of
+from rehearsal.sessions.session import MOST_UNDONE, History, Session
 
 from rehearsal.planning.plan_guidance import ABOVE_MM, AHEAD, DEG_PER_MM_OFF, NEAR_MM, PlanGuidance
-from rehearsal.sessions.session import MOST_UNDONE, History, Session
 from render import scene_view, transducer_shape
 from render.keys import Keys, begin
 from render.scene_view import DONE, TO_GO, PlanLines

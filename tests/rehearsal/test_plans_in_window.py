@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from plan_ball import over_ball, plan_of, straight_pass, sweep_of
+from rehearsal.open_window import probe_with_settings
 
 from rehearsal.notices import Notices
-from rehearsal.open_window import probe_with_settings
 from rehearsal.planning import plans_in_window
 from rehearsal.planning.plan_file import PlanError, read_plan
 from rehearsal.planning.plan_guidance import PlanGuidance

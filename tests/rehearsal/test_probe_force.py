@@ -5,13 +5,13 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from rehearsal.sessions.session import Session
 from small_bead_case import briefly, small_anatomy
 
 from rehearsal.pressed_organ import PressedOrgan
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.packed_arrays import unpack_wrenches
 from rehearsal.sessions.recorder import record
-from rehearsal.sessions.session import Session
 from scenes.scene import with_options
 from ultrasound.probe_manipulator import array_face_centre
 

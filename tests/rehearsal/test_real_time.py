@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import rotation_about
+from rehearsal.real_time.shared_state import SLOTS, SharedState
 
 from rehearsal.pressed_organ import OrganState, PressedOrgan, Step
 from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.real_time.pace import BUSY, LEAST_ITERATIONS, SPARE, STEPS_DOWN, STEPS_UP, Pace
 from rehearsal.real_time.pose_path import CATCH_UP, LONGEST_S, PosePath
-from rehearsal.real_time.shared_state import SLOTS, SharedState
 from rehearsal.real_time.solver_loop import SolverLoop, SolverSetup
 from rehearsal.real_time.solver_process import SolverEnded, SolverProcess
 from rehearsal.real_time.started_process import start_process

@@ -8,11 +8,11 @@ import pytest
 import SimpleITK as sitk
 import trimesh
 from coarse_patient import thinned
+from rehearsal.frame import image_view
+from rehearsal.open_window import initial_settings
 from slicing import hounsfield, organ_mask
 
-from rehearsal.frame import image_view
 from rehearsal.measurements.run_report import Tally
-from rehearsal.open_window import initial_settings
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import load_anatomy
 from scenes.patients.patient_folder import save_patient

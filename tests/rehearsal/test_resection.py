@@ -11,13 +11,14 @@ import pytest
 import trimesh
 from coarse_patient import coarse_patient
 from conftest import ROOT
+from rehearsal.inputs.user_input import UserInput
+from rehearsal.open_window import geometry_of
+from rehearsal.sessions.session import Session
 
 from rehearsal.asked_files import read_files
 from rehearsal.commands.command_line import CommandError
 from rehearsal.commands.rehearse_options import RehearseOptions
-from rehearsal.inputs.user_input import UserInput
 from rehearsal.measurements.live_measurements import LiveMeasurements
-from rehearsal.open_window import geometry_of
 from rehearsal.resection import proposal
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.judgement import findings_of
@@ -48,7 +49,6 @@ from rehearsal.resection.script import ResectionScript, ScriptedAction
 from rehearsal.sessions.packed_arrays import pack_state, unpack_state
 from rehearsal.sessions.recorder import record
 from rehearsal.sessions.replay import Replay
-from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import read_log
 from rehearsal.tracking.pose_file import PoseError, load_timed_poses
 from render.viewer import Controls, Settings

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from rehearsal.inputs.input_source import ReplayInput
+from rehearsal.inputs.user_input import UserInput
+from rehearsal.sessions.session import Session
 from test_undo_history import STEP_S, Numbers, ray, step
 
 import app
 from rehearsal.configuration import probe_of
-from rehearsal.inputs.input_source import ReplayInput
-from rehearsal.inputs.user_input import UserInput
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.script import ResectionScript, ScriptedAction
 from rehearsal.sessions import recorder
@@ -34,7 +35,6 @@ from rehearsal.sessions.packed_arrays import (
 )
 from rehearsal.sessions.recorder import SessionRecorder, record
 from rehearsal.sessions.replay import Replay
-from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import (
     Event,
     Header,

@@ -12,19 +12,19 @@ import pytest
 from coarse_patient import coarse_patient
 from null_viewer import NullViewer
 from one_step_solver import OneStepSolver
+from rehearsal.coordinates import probe_in_patient
+from rehearsal.frame import WindowFrames
+from rehearsal.open_window import initial_settings
+from rehearsal.sessions.open_session import open_session
 
 import app
 from rehearsal import headless, run
 from rehearsal.asked_files import AskedFiles
 from rehearsal.build_solver import step_settings
 from rehearsal.commands.rehearse_options import RehearseOptions
-from rehearsal.coordinates import probe_in_patient
-from rehearsal.frame import WindowFrames
 from rehearsal.measurements.live_measurements import LiveMeasurements
-from rehearsal.open_window import initial_settings
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions import recorder
-from rehearsal.sessions.open_session import open_session
 from rehearsal.sessions.packed_arrays import pack_seen
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session_file import Header, Log, SessionError, read_log

@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import rotation_about
+from rehearsal.coordinates import probe_in_patient
+from rehearsal.inputs.input_source import ReplayInput
+from rehearsal.inputs.user_input import UserInput
+from rehearsal.sessions.session import Session
+from rehearsal.tracking.tracked_probe import TrackEnded, has_moved, played_pose
 from test_session import header
 from test_undo_history import STEP_S, Numbers, ray, shown, step
 
 import app
-from rehearsal.coordinates import probe_in_patient
-from rehearsal.inputs.input_source import ReplayInput
-from rehearsal.inputs.user_input import UserInput
 from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import Replay
-from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import read_log
 from rehearsal.tracking.pose_file import PoseError, TimedPoses
 from rehearsal.tracking.track_file import check_near, load_track
-from rehearsal.tracking.tracked_probe import TrackEnded, has_moved, played_pose
 from render.viewer import Controls, Settings
 from ultrasound.probe_manipulator import image_plane
 from ultrasound.sweep import Sweep, SweepError, transform_fields

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-
 from rehearsal.inputs.user_input import UserInput
+from rehearsal.sessions.session import MOST_UNDONE, SETTLED, History, Session
+
 from rehearsal.pressed_organ import PressedOrgan, Step
 from rehearsal.rehearsal import RehearsalState
 from rehearsal.resection.resection_state import NO_RESECTION, Resection
 from rehearsal.resection.score_line import ResectionError
-from rehearsal.sessions.session import MOST_UNDONE, SETTLED, History, Session
 from render.viewer import Controls, Settings
 from scenes.tissue import NeoHookeanTissue
 from sim.body import BodyState

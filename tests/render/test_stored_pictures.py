@@ -76,7 +76,9 @@ class Scene:
         put(self.model, rest + 0.008 * rest[:, [1, 2, 0]] ** 2 * [1, -1, 0.5])
         self.surface = Skin(self.model.carrier, self.anatomy.organ.vertices)
         self.tumour = Skin(self.model.carrier, TUMOUR_SURFACE.vertices)
-        self.scanner = Scanner(self.anatomy, Embedding(self.model.carrier, self.anatomy.organ, 3.0), PROBE, PIXELS)
+        self.scanner = Scanner(
+            self.anatomy, Embedding(self.model.carrier, self.anatomy.organ, 3.0), PROBE, PIXELS
+        )
 
     def plane(self, shift: np.ndarray, turn: np.ndarray) -> ImagePlane:
         """The image plane of the probe shifted by so much along its own axes [mm], and turned about them at its face."""

@@ -218,7 +218,9 @@ def test_attached_points_move_with_the_body(free):
 
 
 def test_a_press_does_not_fold_the_surroundings(laid):
-    embedding = Embedding(laid.solver.model.carrier, laid.mesh, embedding_cell_mm(laid.tissue), margin_mm=25.0)
+    embedding = Embedding(
+        laid.solver.model.carrier, laid.mesh, embedding_cell_mm(laid.tissue), margin_mm=25.0
+    )
     laid.press(laid.settings(G), 18.0, 13.0, 12)
     embedding.update()
     first, *others = array_of(embedding.skin.vertices)[array_of(embedding.tetrahedron)].transpose(1, 0, 2)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import rotation_about
-
 from rehearsal.coordinates import probe_in_patient
+
 from sim.embedding import Unmoved
 from sim.fields import fill
 from ultrasound.ground_truth_labels import GroundTruthLabels

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from conftest import rotation_about
+from rehearsal.coordinates import probe_in_patient
 
 import app
 from rehearsal.commands.reconstruct_command import _describe, in_words
-from rehearsal.coordinates import probe_in_patient
 from rehearsal.notices import Notices
 from rehearsal.reconstruction import compression_correction
 from rehearsal.reconstruction.compression_correction import CompressionCorrection

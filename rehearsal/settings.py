@@ -1,21 +1,31 @@
-"""The window on a rehearsal: its geometry, and its settings: where the sliders start, and what they set of the probe."""
+"""Settings of a rehearsal: where they start, what they set of the probe, and those of a recorded session."""
 
-import numpy as np
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
 
-from rehearsal.rehearsal import Rehearsal
-from render.display import window_size
-from render.viewer import Geometry, ScannerSettings, Settings
-from render.window import Window
-from render.window_layout import FULL_SIZE
-from ultrasound.probe import TGC_SLIDERS, Probe
+from errors import FOUND, UserError
+from rehearsal.build_solver import step_settings
+from rehearsal.case import Case
+from render.viewer import TECHNIQUES, ScannerSettings, Settings
+from ultrasound.probe import DETAIL_LEVELS, DOPPLER_MODES, MODES, TGC_SLIDERS, Probe
+from ultrasound.target import TARGETS
+
+CHOICES: dict[str, tuple[str, ...]] = {
+    "mode": MODES,
+    "detail_level": DETAIL_LEVELS,
+    "doppler": DOPPLER_MODES,
+    "plan_for": TARGETS,
+    "technique": TECHNIQUES,
+}
 
 TGC = tuple(f"tgc_{i + 1}" for i in range(TGC_SLIDERS))
 
 
-def initial_settings(rehearsal: Rehearsal) -> Settings:
+def initial_settings(case: Case) -> Settings:
     """The settings at the start: those of scene and probe."""
-    scene, step, probe = rehearsal.scene, rehearsal.settings, rehearsal.probe
-    tissue = scene.tissue
+    scene, probe = case.scene, case.probe
+    tissue, step = scene.tissue, step_settings(scene.tissue, scene.solver)
     settings = Settings(
         young_kpa=getattr(tissue, "young_kpa", None),
         stiffness=step.stiffness if hasattr(tissue, "stiffness") else None,
@@ -68,43 +78,25 @@ def probe_with_settings(probe: Probe, settings: ScannerSettings) -> Probe:
     )
 
 
-def open_viewer(rehearsal: Rehearsal, visible: bool) -> Window:
-    """Open a window that shows a rehearsal, on the screen or off it. Raises NoVulkan."""
-    size = window_size() if visible else FULL_SIZE
-    return Window(geometry_of(rehearsal), initial_settings(rehearsal), size, visible)
+def set_settings(settings: Settings, values: dict[str, Any]) -> None:
+    """Set what a session recorded. Raises UserError for an unknown setting or a value out of its range."""
+    known = {setting.name: setting.metadata for setting in fields(settings)}
+    for name, value in values.items():
+        if name not in known or not _fits(getattr(settings, name), value, name, known[name]):
+            raise UserError(
+                f"the session sets {name} to {FOUND.repr(value)}, which it cannot be: its file is damaged"
+            )
+        setattr(settings, name, value)
 
 
-def geometry_of(rehearsal: Rehearsal) -> Geometry:
-    """The geometry that a window draws."""
-    tumour, support = None, None
-    if rehearsal.tumour is not None and rehearsal.tumour_skin is not None:
-        tumour = rehearsal.tumour_skin.vertices, np.asarray(rehearsal.tumour.faces, np.int32)
-    if rehearsal.supports:
-        fixed = rehearsal.supports[0]
-        support = np.asarray(fixed.vertices, np.float32), np.asarray(fixed.faces, np.int32)
-    specimen = bed = None
-    if rehearsal.cut is not None:
-        bed = (
-            rehearsal.organ_skin.vertices,
-            np.asarray(rehearsal.organ.faces, np.int32)[rehearsal.cut.on_remnant],
-        )
-        specimen = (
-            rehearsal.specimen_beside().astype(np.float32),
-            np.asarray(rehearsal.cut.specimen.faces, np.int32),
-        )
-    return Geometry(
-        organ=(rehearsal.organ_skin.vertices, np.asarray(rehearsal.organ.faces, np.int32)),
-        bounds=rehearsal.whole_organ.bounds,
-        up=-rehearsal.gravity_direction,
-        transducer_size_mm=rehearsal.size_mm,
-        transducer_radius_mm=rehearsal.probe.radius_mm,
-        frequency_range_mhz=rehearsal.probe.frequency_range_mhz,
-        tumour=tumour,
-        parts={
-            tissue: (skin.vertices, np.asarray(rehearsal.parts[tissue].faces, np.int32))
-            for tissue, skin in rehearsal.part_skins.items()
-        },
-        support=support,
-        specimen=specimen,
-        bed=bed,
-    )
+def _fits(usual: Any, value: Any, name: str, about: Mapping[str, Any]) -> bool:
+    """Whether a value is of a setting's kind and within its slider."""
+    if name in CHOICES:
+        return value in CHOICES[name]
+    if value is None:
+        return usual is None
+    if isinstance(usual, bool) or isinstance(value, bool):
+        return type(value) is type(usual)
+    if not isinstance(value, int if isinstance(usual, int) else (int, float)):
+        return False
+    return not about or bool(about["low"] <= value <= about["high"])

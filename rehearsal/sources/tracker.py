@@ -1,38 +1,37 @@
-"""A tracked probe as input: the newest pose of a tracker, or the poses of a file at the rehearsal's time."""
+"""A tracked probe moves the transducer: the newest pose of a tracker, or the poses of a file at the rehearsal's time."""
 
 from collections.abc import Callable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rehearsal.coordinates import transducer_at
-from rehearsal.rehearsal import Rehearsal
-from rehearsal.sessions.session import Session
+from rehearsal.case import Case
 from rehearsal.tracking.pose_file import TimedPoses
 
 # A resting probe moves less than this: tremor of a hand, and noise of a tracker.
 STILL_MM, STILL_DEG = 3.0, 3.0
-# Gives the probe's newest pose in the patient (4, 4), in PLUS's axes (LPS, mm); None while it is not tracked. May raise TrackEnded.
-PoseSource = Callable[[], np.ndarray | None]
+# Gives the probe's pose in the patient (4, 4), in PLUS's axes (LPS, mm), at a time [s] of the session; None while it is not tracked.
+# May raise TrackEnded.
+PoseSource = Callable[[float], np.ndarray | None]
 
 
 class TrackEnded(Exception):
     """There are no more poses; the message is for the user."""
 
 
-def played_pose(poses: TimedPoses, session: Session) -> np.ndarray | None:
-    """The pose of a file at the simulated time of a session: a ``PoseSource``."""
+def played_pose(poses: TimedPoses, time_s: float) -> np.ndarray | None:
+    """The pose of a file at a time [s]: a ``PoseSource``."""
     # The time is a sum of steps: its rounding must not skip the last pose.
-    if session.time_s > poses.length_s + 1e-9:
+    if time_s > poses.length_s + 1e-9:
         raise TrackEnded("End of the tracked file: mouse and keys control the probe")
-    return poses.at(session.time_s)
+    return poses.at(time_s)
 
 
-class TrackingInput:
+class Tracker:
     """Goals for the transducer from a tracked probe; ``is_lost`` while it is not tracked."""
 
-    def __init__(self, tracked: PoseSource, rehearsal: Rehearsal) -> None:
-        self.tracked, self.rehearsal = tracked, rehearsal
+    def __init__(self, tracked: PoseSource, case: Case) -> None:
+        self.tracked, self.case = tracked, case
         self.is_lost = False
         self._waits = False
         self._resting_pose: np.ndarray | None = None
@@ -41,16 +40,16 @@ class TrackingInput:
         """Give no goals until the tracked probe moves."""
         self._waits, self._resting_pose = True, None
 
-    def goal(self) -> np.ndarray | None:
-        """The transducer's next goal (4, 4); None to stay. May raise TrackEnded."""
-        pose = self.tracked()
+    def goal(self, time_s: float) -> np.ndarray | None:
+        """The transducer's next goal (4, 4) at a time [s] of the session; None to stay. May raise TrackEnded."""
+        pose = self.tracked(time_s)
         self.is_lost = pose is None
         if pose is None:
             return None
         if self._waits:
             self._resting_pose = pose if self._resting_pose is None else self._resting_pose
             self._waits = not has_moved(self._resting_pose, pose)
-        return None if self._waits else transducer_at(self.rehearsal, pose)
+        return None if self._waits else self.case.transducer_at(pose)
 
 
 def has_moved(before: np.ndarray, now: np.ndarray) -> bool:

@@ -1,0 +1,50 @@
+"""What a window draws of an anatomy: surfaces that move, and those that do not."""
+
+import numpy as np
+
+from rehearsal.deformed_anatomy import DeformedAnatomy
+from rehearsal.settings import initial_settings
+from render.display import window_size
+from render.viewer import Geometry
+from render.window import Window
+from render.window_layout import FULL_SIZE
+
+
+def open_viewer(anatomy: DeformedAnatomy, visible: bool) -> Window:
+    """Open a window that shows an anatomy, on the screen or off it. Raises NoVulkan."""
+    size = window_size() if visible else FULL_SIZE
+    return Window(drawn_geometry(anatomy), initial_settings(anatomy.case), size, visible)
+
+
+def drawn_geometry(anatomy: DeformedAnatomy) -> Geometry:
+    """What a window draws, of the geometry that is shown."""
+    case, tumour, support = anatomy.case, None, None
+    if anatomy.tumour is not None and anatomy.drawn_tumour is not None:
+        tumour = anatomy.drawn_tumour, np.asarray(anatomy.tumour.faces, np.int32)
+    if anatomy.supports:
+        fixed = anatomy.supports[0]
+        support = np.asarray(fixed.vertices, np.float32), np.asarray(fixed.faces, np.int32)
+    faces = np.asarray(anatomy.organ.faces, np.int32)
+    specimen = bed = None
+    if anatomy.cut is not None:
+        bed = anatomy.drawn_organ, faces[anatomy.cut.on_remnant]
+        specimen = (
+            anatomy.specimen_beside().astype(np.float32),
+            np.asarray(anatomy.cut.specimen.faces, np.int32),
+        )
+    return Geometry(
+        organ=(anatomy.drawn_organ, faces),
+        bounds=case.organ.bounds,
+        up=-case.gravity_direction,
+        transducer_size_mm=case.size_mm,
+        transducer_radius_mm=case.probe.radius_mm,
+        frequency_range_mhz=case.probe.frequency_range_mhz,
+        tumour=tumour,
+        parts={
+            tissue: (vertices, np.asarray(anatomy.geometry.parts[tissue].faces, np.int32))
+            for tissue, vertices in anatomy.drawn_parts.items()
+        },
+        support=support,
+        specimen=specimen,
+        bed=bed,
+    )

@@ -1,0 +1,40 @@
+"""Undo, redo and bookmarks as a value: the numbers of the states that they restore. ``Timeline`` keeps the states themselves."""
+
+from dataclasses import dataclass, replace
+
+MOST_UNDONE = 40
+
+
+@dataclass(frozen=True)
+class History:
+    """Numbers of states: ``before`` each action that can be undone, those that were ``undone``, and ``bookmarks``, the newest last."""
+
+    before: tuple[int, ...] = ()
+    undone: tuple[int, ...] = ()
+    bookmarks: tuple[int, ...] = ()
+
+    @property
+    def numbers(self) -> frozenset[int]:
+        """All states that may be restored."""
+        return frozenset((*self.before, *self.undone, *self.bookmarks))
+
+    def begun(self, now: int) -> "History":
+        """After an action began in a state: what was undone before it cannot be redone."""
+        return replace(self, before=(*self.before, now)[-MOST_UNDONE:], undone=())
+
+    def undo(self, now: int) -> tuple["History", int | None]:
+        """The history after an undo in a state, and the state to restore; None where there is nothing to undo."""
+        if not self.before:
+            return self, None
+        return replace(self, before=self.before[:-1], undone=(*self.undone, now)), self.before[-1]
+
+    def redo(self, now: int) -> tuple["History", int | None]:
+        """The history after a redo in a state, and the state to restore; None where there is nothing to redo."""
+        if not self.undone:
+            return self, None
+        before = (*self.before, now)[-MOST_UNDONE:]
+        return replace(self, before=before, undone=self.undone[:-1]), self.undone[-1]
+
+    def marked(self, now: int) -> "History":
+        """With a bookmark of a state."""
+        return replace(self, bookmarks=(*self.bookmarks, now))

@@ -1,0 +1,148 @@
+"""The window's loop. Each time around:
+
+1. the source gives commands: from the user's controls, a recorded session or a tracked probe; the solver's process takes them;
+2. while it makes the next step, the observers look at the last frame, and its 3D view is drawn;
+3. the newest frame is shown: surfaces and image plane move;
+4. its image is computed;
+5. it is drawn, with what was observed.
+"""
+
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+
+from rehearsal.deformed_anatomy import DeformedAnatomy
+from rehearsal.drawn_geometry import drawn_geometry
+from rehearsal.imaging import image_view
+from rehearsal.loop.command import SetValues
+from rehearsal.loop.frame import Frame
+from rehearsal.loop.observer import Observer, Source
+from rehearsal.loop.stepper import Stepper
+from rehearsal.measurements.live_measurements import LiveMeasurements
+from rehearsal.real_time.frame_times import FrameTimes
+from rehearsal.settings import probe_with_settings, set_settings
+from rehearsal.window_panel import WindowPanel
+from render.viewer import Controls, ScannerSettings, View
+from render.window import Window
+from ultrasound.probe import Probe
+from ultrasound.scanner import IMAGES_OF_MODE
+
+PREPARING = "PREPARING THE IMAGE"
+# How long a picture waits for the step that shows its input.
+MOST_WAIT_S = 0.1
+# A frame that took longer moves the transducer as if it had taken this long.
+MOST_ELAPSED_S = 0.25
+# Times of images that a window keeps.
+MOST_TIMES = 100
+
+
+@dataclass
+class WindowLoop:
+    """A rehearsal in a window: ``run`` until it is closed. While it is frozen the solver makes no step."""
+
+    window: Window
+    stepper: Stepper
+    source: Source
+    anatomy: DeformedAnatomy
+    measurements: LiveMeasurements
+    observers: list[Observer]
+    panel: WindowPanel
+    times: FrameTimes = field(default_factory=FrameTimes)
+    frozen: bool = False
+    _image_ms: list[float] = field(default_factory=list, init=False)
+    _input_at_s: float | None = field(default=None, init=False)
+    _version: int = field(default=0, init=False)
+    _kinds: set[tuple[str | bool, ...]] = field(default_factory=set, init=False)
+
+    def run(self) -> None:
+        """Draw frames until the window is closed."""
+        frame, view = self.anatomy.frame, None
+        probe = self.anatomy.case.probe
+        while self.window.running:
+            controls = self._controls()
+            with self.times.stage("input"):
+                self._submit(frame, controls)
+            with self.times.stage("last state"):
+                self._use_waiting_time(frame, probe, view)
+            probe = probe_with_settings(self.anatomy.case.probe, controls.settings)
+            self._announce_new_kind(view, controls.settings)
+            with self.times.stage("state"):
+                frame = self._newest()
+            with self.times.stage("image"):
+                view = self._image(probe, controls)
+            with self.times.stage("panel"):
+                view = self.panel.present(view, probe, controls, self.times, self._image_ms)
+            with self.times.stage("drawing"):
+                self.window.draw(view)
+            self._end(frame, view, controls)
+        self._observe(frame, probe)
+
+    def _controls(self) -> Controls:
+        """The user's controls; freeze is a toggle, which what changes the tissue ends."""
+        controls = self.window.read_controls()
+        ends_freeze = controls.restores or controls.operates or controls.take_over
+        if controls.freeze or (self.frozen and ends_freeze):
+            self.frozen = not self.frozen
+            self.times.restart()
+        self.panel.control(controls, self.frozen)
+        return replace(controls, frozen=self.frozen)
+
+    def _submit(self, frame: Frame, controls: Controls) -> None:
+        now, before = perf_counter(), self._input_at_s
+        self._input_at_s = now
+        step_s = self.anatomy.case.scene.solver.time_step_s
+        elapsed_s = step_s if before is None else min(now - before, MOST_ELAPSED_S)
+        for command in self.source.commands(frame, controls, elapsed_s):
+            if isinstance(command, SetValues):
+                # Those of a replay are the window's too.
+                set_settings(controls.settings, command.values)
+            self.stepper.submit(command)
+
+    def _use_waiting_time(self, frame: Frame, probe: Probe, view: View | None) -> None:
+        before = self.measurements.latest
+        self._observe(frame, probe)
+        if view is not None:
+            self.window.draw_scene(view, may_wait=self.measurements.latest is not before)
+
+    def _observe(self, frame: Frame, probe: Probe) -> None:
+        if not frame.events:
+            return
+        self.times.steps.extend(frame.steps)
+        for observer in self.observers:
+            observer.observe(frame, probe)
+
+    def _newest(self) -> Frame:
+        """Show the newest frame."""
+        frame = self.stepper.newest(MOST_WAIT_S)
+        self.anatomy.show(frame)
+        if frame.geometry.version != self._version:
+            self._version = frame.geometry.version
+            self.window.change_geometry(drawn_geometry(self.anatomy))
+            self.panel.forget_images()
+        return frame
+
+    def _image(self, probe: Probe, controls: Controls) -> View:
+        """The images, also of frozen tissue with other settings; of an earlier frame those that it had.
+
+        They have the pixels of their boxes in the window, unless they are recorded or sent too.
+        """
+        if self.panel.shows_earlier:
+            return self.panel.cine.shown.view
+        settings = controls.settings
+        count, (width, depth, _) = len(IMAGES_OF_MODE[settings.mode]), probe.extent_mm
+        shape = self.window.image_shape(count, width, depth) if self.panel.only_shows else None
+        view = image_view(self.anatomy, probe, settings, self._image_ms, shape)
+        del self._image_ms[:-MOST_TIMES]
+        return view
+
+    def _announce_new_kind(self, view: View | None, settings: ScannerSettings) -> None:
+        """Say over the last image that one of a new kind is prepared: compiling its kernels may take seconds."""
+        steered = settings.colour_steering_deg != 0
+        kind = settings.mode, settings.detail_level, settings.compounding, settings.doppler, steered
+        if view is not None and kind not in self._kinds:
+            self.window.draw(replace(view, status=PREPARING))
+        self._kinds.add(kind)
+
+    def _end(self, frame: Frame, view: View, controls: Controls) -> None:
+        input_s = frame.steps[-1].input_s if frame.steps and not self.frozen else None
+        self.times.end_frame(frame.time_s, input_s or None)
+        self.panel.save(controls, view, self.window.picture)

@@ -1,0 +1,240 @@
+"""What a window shows beside frame and image: measurements, score, cine, caliper, notices; and the files that the user saves."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from rehearsal.announcements import Announcements
+from rehearsal.caliper import Caliper
+from rehearsal.cine import Cine, CineFrame
+from rehearsal.deformed_anatomy import DeformedAnatomy
+from rehearsal.image_and_surface_files import save_screenshot, save_surfaces, save_view
+from rehearsal.imaging import image_view, readouts
+from rehearsal.loop.observer import Source
+from rehearsal.measurements.live_measurements import LiveMeasurements
+from rehearsal.notices import Notices
+from rehearsal.planning.plans_in_window import PlanControl
+from rehearsal.real_time.frame_times import FrameTimes
+from rehearsal.resection.resection_view import ResectionView, cut_settings
+from rehearsal.settings import probe_with_settings
+from rehearsal.sources.scripted import ReplaySource
+from rehearsal.sources.user import UserSource
+from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer, send_live
+from rehearsal.tracking.sweep_recording import SweepRecorder
+from render.keys import Keys
+from render.viewer import Controls, Settings, View
+from scenes.import_findings import acknowledge
+from scenes.scene import SceneError
+from ultrasound.probe import Probe
+
+# How long a notice stays on the screen.
+NOTICE_S = 2.0
+# The simulation counts as real time from this share of it on.
+REAL_TIME = 0.9
+# What the figures of speed on the screen are of.
+RECENT_S, RECENT_FRAMES = 1.0, 20
+HOW_TO_ACKNOWLEDGE = "{acknowledge}: I have checked this in check.png"
+HOW_TO_PRESS = "{press} or {push} presses"
+
+
+class WindowPanel:
+    """Adds to a view what the user reads, and does what the keys ask for that changes no tissue.
+
+    ``folder`` is the scene's: the patient's, where one was imported; ``warnings`` of the import are those that nobody has acknowledged.
+    ``counts`` are the sizes of the tissue model.
+    """
+
+    def __init__(
+        self,
+        anatomy: DeformedAnatomy,
+        source: Source,
+        measurements: LiveMeasurements,
+        announcements: Announcements,
+        resection: ResectionView,
+        plans: PlanControl,
+        notices: Notices,
+        out: Path,
+        keys: Keys,
+        counts: dict[str, int],
+        link: OpenIGTLinkServer | None = None,
+        warnings: tuple[str, ...] = (),
+        folder: Path = Path(),
+    ) -> None:
+        self.anatomy, self.source, self.measurements = anatomy, source, measurements
+        self.announcements, self.resection, self.plans, self.notices = (
+            announcements,
+            resection,
+            plans,
+            notices,
+        )
+        self.out, self.keys, self.counts, self.link = out, keys, counts, link
+        self.warnings, self.folder = warnings, folder
+        self.sweeping = SweepRecorder(anatomy, notices)
+        self.cine, self.caliper = Cine(), Caliper()
+        self._frozen = False
+        self._notice, self._notice_until = "", 0.0
+
+    @property
+    def shows_earlier(self) -> bool:
+        """Whether the user looks at an earlier frame of the cine memory."""
+        return self._frozen and self.cine.back > 0
+
+    @property
+    def only_shows(self) -> bool:
+        """Whether the images are only shown, and neither recorded nor sent."""
+        return not self.sweeping.status and self.link is None
+
+    def forget_images(self) -> None:
+        """The frames of the cine memory show other surfaces."""
+        self.cine = Cine()
+
+    def control(self, controls: Controls, frozen: bool) -> None:
+        """Do what the keys ask for before the frame."""
+        self._frozen = frozen
+        if frozen:
+            self.cine.go(controls.cine)
+        if controls.reset:
+            self.caliper.points = ()
+        self.notices.post(controls.message)
+        if controls.acknowledge and self.warnings:
+            self._try(self._acknowledge)
+        self.plans.control(controls)
+
+    def present(
+        self, view: View, probe: Probe, controls: Controls, times: FrameTimes, image_ms: list[float]
+    ) -> View:
+        """The view with all that the user reads, sent over the link, and kept in the cine memory."""
+        settings, time_s = controls.settings, self.anatomy.frame.time_s
+        if not self._frozen:
+            self.sweeping.add(time_s, view, probe)
+        if controls.sweep:
+            self.sweeping.toggle(self.out)
+        shown = self.cine.shown if self.shows_earlier else self._measured(view, probe, settings)
+        view = shown.view if self.shows_earlier else self.with_resection(shown.view, settings)
+        self.caliper.point(controls.pointed_mm, view.transducer_pose)
+        if not self._frozen:
+            self.caliper.go_with(view.transducer_pose)
+        self._show_notices()
+        step_ms = [step.took_ms for step in islice(reversed(times.steps), RECENT_FRAMES)]
+        figures = readouts(self.counts, step_ms, image_ms, self._indentation_mm())
+        return replace(
+            view,
+            caliper_mm=self.caliper.points,
+            caliper=self.caliper.figure(shown),
+            readouts=figures | _speeds(times),
+            warnings=self._warnings(),
+            clock=f"{time_s:.1f} s",
+            pace=self._pace(times),
+            status=self._status(view, settings),
+            notes={name: self._with_hint(note) for name, note in view.notes.items()},
+        )
+
+    def with_resection(self, view: View, settings: Settings) -> View:
+        """A view with the score and the coming cut."""
+        planned = cut_settings(settings)
+        self.resection.update(planned, lambda points: self.measurements.coverage.is_seen(points))
+        score = self.resection.score(planned.margin_mm)
+        if score is None:
+            return view
+        return replace(view, score=score, resection_mm=self.resection.section())
+
+    def save(self, controls: Controls, view: View, picture: Callable[[], np.ndarray]) -> None:
+        """Save the files that the user asks for."""
+        if controls.screenshot:
+            self._try(lambda: save_screenshot(picture(), self.out))
+        if controls.export:
+            self._try(partial(self._export, controls.settings, view))
+
+    def _measured(self, view: View, probe: Probe, settings: Settings) -> CineFrame:
+        """The view with its measurements, sent over the link and, unless frozen, kept in the cine memory."""
+        send_live(self.link, self.anatomy, view, probe)
+        rest = self.anatomy.rest_grid()
+        shown = CineFrame(perf_counter(), self.measurements.onto(view, settings), rest)
+        if not self._frozen:
+            self.cine.keep(shown)
+        return shown
+
+    def _indentation_mm(self) -> float:
+        return self.measurements.manipulator.indentation_mm(self.anatomy.pose)
+
+    def _warnings(self) -> tuple[str, ...]:
+        """The key that acknowledges the warnings of the import, and these: of many, the last are not shown."""
+        shown = tuple(f"Import: {text}" for text in self.warnings)
+        return (self.keys.worded(HOW_TO_ACKNOWLEDGE), *shown) if shown else ()
+
+    def _pace(self, times: FrameTimes) -> str:
+        """Simulated over real time, if the simulation is slower; empty while frozen."""
+        factor = times.rates(RECENT_S)[1]
+        return "" if self._frozen or factor >= REAL_TIME else f"{factor:.1g} x real"
+
+    def _with_hint(self, note: str) -> str:
+        """A note that there is no contact, with the keys that press if these control the probe."""
+        source = self.source.user if isinstance(self.source, ReplaySource) else self.source
+        if self._frozen or not isinstance(source, UserSource) or not source.is_manual:
+            return note
+        return self.keys.worded(f"{note}\n{HOW_TO_PRESS}")
+
+    def _status(self, view: View, settings: Settings) -> str:
+        """The text over the images, the most important first: text that does not fit is cut at the end."""
+        restored = "STATE RESTORED" if self.announcements.has_restored else ""
+        is_new = perf_counter() < self._notice_until
+        news = [self._notice] if is_new else [self._state(), self.plans.status]
+        score = self.resection.status(cut_settings(settings))
+        parts = [restored, view.status, self.sweeping.status, *news, score]
+        return self.keys.worded("   ".join(filter(None, parts)))
+
+    def _state(self) -> str:
+        if not self._frozen:
+            return self.source.status
+        return f"FROZEN   {self.cine.age_s:.1f} s" if self.cine.back else "FROZEN"
+
+    def _show_notices(self) -> None:
+        """Show the notices of this frame in the panel and in the terminal."""
+        for text in self.notices.present(self.keys.worded):
+            self._notice, self._notice_until = text[0].upper() + text[1:], perf_counter() + NOTICE_S
+
+    def _try(self, write: Callable[[], None]) -> None:
+        """Write files that the user asked for."""
+        try:
+            write()
+        except (OSError, SceneError) as error:
+            reason = error.strerror if isinstance(error, OSError) else str(error)
+            self.notices.post(f"Not saved: {reason}", in_terminal=False)
+
+    def _acknowledge(self) -> None:
+        """Mark the warnings of the import as checked. Raises OSError, SceneError."""
+        acknowledge(self.folder, self.warnings)
+        self.warnings = ()
+        self.notices.post("warnings of the import acknowledged")
+
+    def _export(self, settings: Settings, view: View) -> None:
+        """Save images and surfaces; say what is missing, and why. Raises OSError."""
+        probe = probe_with_settings(self.anatomy.case.probe, settings)
+        if self.only_shows and not self.shows_earlier:
+            # With all pixels of the scene.
+            whole = image_view(self.anatomy, probe, replace(settings, persistence_percent=0))
+            view = replace(view, images=whole.images, doppler=whole.doppler)
+        begin, missing = save_view(view, probe, self.out), []
+        if view.notes.keys() & view.images.keys():
+            missing.append("B-mode image black: the probe does not touch the organ")
+        if self.shows_earlier:
+            missing.append("no organ (PLY), which has moved since: {freeze} continues")
+        else:
+            save_surfaces(self.anatomy, self.out, begin)
+        self.notices.post("   ".join([f"saved {begin.rstrip('-')}", *missing]), in_terminal=False)
+        self.notices.post("; ".join(missing), on_screen=False)
+
+
+def _speeds(times: FrameTimes) -> dict[str, str]:
+    """Pictures a second, and the time from an input to its picture."""
+    latency_ms = times.latency_ms
+    recent = [latency_ms[-n] for n in range(1, min(len(latency_ms), RECENT_FRAMES) + 1)]
+    return {
+        "frames": f"{times.rates(RECENT_S)[0]:.0f} /s",
+        "latency": f"{np.median(recent):.0f} ms" if recent else "",
+    }
