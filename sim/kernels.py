@@ -48,7 +48,7 @@ class kernel:
 
     def __call__(self, *values: Any, **named: Any) -> Any:
         if named:
-            values += tuple(named.pop(each.name) for each in self._parameters[len(values) :])
+            values += tuple(named[each.name] for each in self._parameters[len(values) :])
         program = taichi_internals.program()
         if self._program is not program:
             self._program, self._compiled = program, []

@@ -102,7 +102,7 @@ def program() -> Any:
 
 
 def is_supported(backend: Any) -> bool:
-    """Whether a backend, such as ``ti.cuda``, has a device and a driver. Without, Taichi may write to stderr."""
+    """Whether a backend such as ``ti.cuda`` has device and driver; without, Taichi may write to stderr."""
     return bool(misc.is_arch_supported(backend))
 
 
@@ -158,7 +158,7 @@ _patch(snode, "get_traceback", lambda stacklevel=1: "")
 
 
 class ArrayKind(NamedTuple):
-    """An array: Taichi's type of its numbers, the shape of an element, and how many axes it has without those."""
+    """An array: Taichi's type of its numbers, the shape of an element, and how many other axes it has."""
 
     number: Any
     element: tuple[int, ...]

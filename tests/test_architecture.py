@@ -42,15 +42,8 @@ PUBLIC_SUBMODULES = {"math", "profiler", "types", "ui"}
 PRIVATE = {
     *("arr", "prog", "ptr", "mapper", "canvas.canvas", "scene.scene"),
     *("compiled_kernels", "compiling_callable", "current_kernel", "kernel_cpp", "template_slot_locations"),
-    *(
-        "ast_builder",
-        "compile_kernel",
-        "create_function",
-        "launch_kernel",
-        "make_launch_context",
-        "materialize",
-    ),
-    *("set_arg_external_array_with_shape", "set_arg_float", "set_arg_int", "set_arg_ndarray"),
+    *("ast_builder", "compile_kernel", "create_function", "launch_kernel", "make_launch_context"),
+    *("materialize", "set_arg_external_array_with_shape", "set_arg_float", "set_arg_int", "set_arg_ndarray"),
     *("_is_wrapped_kernel", "_traced_records", "_update_records"),
 }
 # Taichi reads its environment when it is imported, which sim/__init__.py must not do.
