@@ -12,8 +12,8 @@ import taichi.math as tm
 
 from render.camera import OrbitCamera
 from render.window_layout import Rect
-from sim.device import TASK
 from sim.fields import array_of
+from sim.taichi_internals import TASK
 
 # Each band of columns is drawn by one thread, all triangles in their order: so the picture does not depend on the threads.
 BANDS = 4

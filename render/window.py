@@ -1,6 +1,6 @@
 """The window, on a screen or off-screen: 3D view, ultrasound panel, sliders, mouse and keys.
 
-The only file that imports taichi.ui. A frame is drawn in this order:
+The only file that uses ti.ui. A frame is drawn in this order:
 1. a full-window background image (background_image.py): panel, images, texts; where no graphics card draws, the 3D view too
    (software_scene.py);
 2. elsewhere, invisible quads near the camera, over the panel and the strip, which fill the depth buffer there, so that no organ covers them;
@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import taichi as ti
-from taichi.ui.utils import get_field_info
 
 from render.background_image import BackgroundImage
 from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
@@ -33,6 +32,7 @@ from render.viewer import SCANNER_GROUPS, Controls, Geometry, Settings, View
 from render.vulkan_device import draws_by_processor
 from render.window_layout import FULL_SIZE, Rect, WindowLayout
 from sim.device import on_cpu
+from sim.taichi_internals import set_image
 
 ZOOM_S = 0.5
 # How far beside a box of sliders the mouse still takes its edge [pixels], and how far it goes in a drag, in shares of the window.
@@ -92,7 +92,7 @@ class Window:
             raise NoVulkan("no Vulkan driver found: the window and its pictures need one") from error
         atexit.register(self.close)
         self._canvas = self._window.get_canvas()
-        self._scene: Any = GraphicsScene(self._window.get_scene(), get_field_info)
+        self._scene: Any = GraphicsScene(self._window.get_scene())
         self._gui = self._window.get_gui()
         self._view: View | None = None
         self._quit = False
@@ -340,7 +340,7 @@ class Window:
 
     def _put_image(self) -> None:
         # Without the 10 ms that Canvas.set_image needs to pack the pixels.
-        self._canvas.canvas.set_image(get_field_info(self._background.pixels.view(np.uint32)[..., 0]))
+        set_image(self._canvas, self._background.pixels.view(np.uint32)[..., 0])
 
     def _draw_by_processor(self, software: SoftwareScene, view: View) -> None:
         """Draw the 3D view into the background image."""
@@ -370,7 +370,7 @@ class Window:
         rects = [self.layout.panel, self.layout.title, self.layout.strip, *self._boxes_over_scene()]
         masked = [self.layout.window_coordinates(rect) for rect in rects]
         self._scene_view.draw(self._scene, view, self.settings, masked)
-        self._canvas.scene(self._scene.scene)
+        self._canvas.scene(self._scene.ggui_scene)
 
     def _set_camera(self) -> None:
         _, up, ahead = self.camera.axes()
@@ -382,4 +382,4 @@ class Window:
         near, far = self.camera.near_far()
         self._ui_camera.z_near(near)
         self._ui_camera.z_far(far)
-        self._scene.scene.set_camera(self._ui_camera)
+        self._scene.ggui_scene.set_camera(self._ui_camera)

@@ -1,53 +1,21 @@
 """Start Taichi on one backend, without its console output."""
 
 import contextlib
-import functools
 import io
 import os
-import sys
-import tempfile
-import textwrap
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import taichi as ti
-from taichi.lang import impl, kernel_impl, snode
-from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+
+from sim import taichi_internals
 
 BACKENDS = {"cuda": ti.cuda, "vulkan": ti.vulkan, "cpu": ti.cpu}
 FEW_CORES = 4
 # By default Taichi keeps 100 MB of compiled kernels. A choice of settings adds 4 MB.
 CACHE_BYTES = 1 << 30
 COUNTS = 64
-# Taichi gives a thread of a CPU at least so many iterations of a loop. A loop of fewer and longer ones runs over TASK times as many,
-# and does something in every TASK-th.
-TASK = 512
 # The program that Taichi runs, and the backend and options that it was asked for.
 _started: tuple = (None, "", {})
-TEMPORARY = Path(tempfile.gettempdir()) / "nephron" / "kernels"
-
-
-def _source_position(context: ASTTransformerContext, node) -> str:
-    """File, line and function of an expression, for error messages."""
-    line = context.src[node.lineno - 1]
-    return f'File "{context.file}", line {node.lineno + context.lineno_offset}, in {context.func.func.__name__}:\n{line}\n'
-
-
-# While Taichi builds a kernel, it reads and wraps the source of a function at each call of it, formats the position of each
-# expression, and formats the call stack for each field, even without an error. This takes more than half of the time, so
-# it is cached or left out here.
-ASTTransformerContext.get_pos_info = _source_position
-kernel_impl.getsourcelines = functools.cache(kernel_impl.getsourcelines)
-kernel_impl.getsourcefile = functools.cache(kernel_impl.getsourcefile)
-kernel_impl.textwrap = SimpleNamespace(
-    fill=functools.cache(textwrap.fill), dedent=functools.cache(textwrap.dedent)
-)
-impl.get_traceback = snode.get_traceback = lambda stacklevel=1: ""
-# Taichi reads the source file to find out whether a function is in a class; the calling frame shows it too.
-kernel_impl._inside_class = lambda level_of_class_stackframe: (
-    "__qualname__" in sys._getframe(level_of_class_stackframe - 1).f_locals
-)
 
 
 class NoDevice(RuntimeError):
@@ -62,9 +30,9 @@ def start(arch: str = "cpu", accepts_wrong_results: bool = False, **options) -> 
     """
     global _started
     if arch == "auto":
-        arch = "cuda" if ti.lang.misc.is_arch_supported(ti.cuda) else "cpu"
+        arch = "cuda" if taichi_internals.is_supported(ti.cuda) else "cpu"
     asked = arch, options
-    if _started == (impl.get_runtime().prog, *asked):
+    if _started == (taichi_internals.program(), *asked):
         return arch
     ti.set_logging_level(ti.ERROR)
     if arch != "cpu" and not is_available(arch):
@@ -72,7 +40,7 @@ def start(arch: str = "cpu", accepts_wrong_results: bool = False, **options) -> 
     options = {
         # LLVM and the graphics drivers optimise too: without Taichi's own pass large kernels compile four to ten times as fast.
         "advanced_optimization": False,
-        "offline_cache_file_path": str(_kernel_folder()),
+        "offline_cache_file_path": str(taichi_internals.kernel_folder()),
         "offline_cache_max_size_of_files": CACHE_BYTES,
         **options,
     }
@@ -83,7 +51,7 @@ def start(arch: str = "cpu", accepts_wrong_results: bool = False, **options) -> 
         raise NoDevice(
             "the Vulkan driver of this machine gives wrong results, as Mesa 22's software driver does; use --arch cpu, or a newer driver"
         )
-    _started = impl.get_runtime().prog, *asked
+    _started = taichi_internals.program(), *asked
     return arch
 
 
@@ -116,26 +84,11 @@ def is_available(arch: str) -> bool:
     stderr, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 2)
     try:
-        return bool(ti.lang.misc.is_arch_supported(BACKENDS[arch]))
+        return taichi_internals.is_supported(BACKENDS[arch])
     finally:
         os.dup2(stderr, 2)
         os.close(stderr)
         os.close(null)
-
-
-def _kernel_folder() -> Path:
-    """Folder of the kernel cache: beside Taichi's default, or a temporary folder if that is not writable.
-
-    In the default folder any other program with Taichi would remove kernels beyond its own limit. With a folder that is not writable
-    Taichi crashes at the end of the process, even with the cache off.
-    """
-    default = Path(impl.default_cfg().offline_cache_file_path)
-    usual = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or default.with_name("nephron"))
-    try:
-        usual.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return TEMPORARY
-    return usual if os.access(usual, os.W_OK) else TEMPORARY
 
 
 def on_cpu() -> bool:

@@ -6,9 +6,11 @@ from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from itertools import pairwise
 from pathlib import Path
+from types import ModuleType
 from typing import NamedTuple
 
 import pytest
+import taichi
 from conftest import ROOT
 
 LAYERS = ("app", "studies", "rehearsal", "render", "ultrasound", "sim", "scenes")
@@ -23,7 +25,29 @@ FORBIDDEN = {
 }
 # What of other layers the screen may name: which choices there are, and the folder itself, which keeps Taichi quiet.
 # Solvers, bodies and scanners stay out: it is handed arrays.
-KNOWN_TO_RENDER = {"sim", "sim.device", "sim.fields", "sim.kernels", "ultrasound.probe", "ultrasound.target"}
+KNOWN_TO_RENDER = {
+    "sim",
+    "sim.device",
+    "sim.fields",
+    "sim.kernels",
+    "sim.taichi_internals",
+    "ultrasound.probe",
+    "ultrasound.target",
+}
+INTERNALS = "sim/taichi_internals.py"
+# What Taichi's documentation has of its modules; render/window.py alone uses ti.ui.
+PUBLIC_MODULES = {"taichi", "taichi.math"}
+PUBLIC_SUBMODULES = {"math", "profiler", "types", "ui"}
+# What of Taichi's objects its documentation does not have, the last names of an expression each.
+PRIVATE = {
+    *("arr", "prog", "ptr", "mapper", "canvas.canvas", "scene.scene"),
+    *("compiled_kernels", "compiling_callable", "current_kernel", "kernel_cpp", "template_slot_locations"),
+    *("ast_builder", "compile_kernel", "create_function", "launch_kernel", "make_launch_context"),
+    *("materialize", "set_arg_external_array_with_shape", "set_arg_float", "set_arg_int", "set_arg_ndarray"),
+    *("_is_wrapped_kernel", "_traced_records", "_update_records"),
+}
+# Taichi reads its environment when it is imported, which sim/__init__.py must not do.
+ENVIRONMENT, BEFORE_IMPORT = ("TI_", "ENABLE_TAICHI_"), "sim/__init__.py"
 
 
 class Import(NamedTuple):
@@ -130,18 +154,52 @@ def test_the_screen_is_handed_arrays():
     assert not wrong, f"render knows {', '.join(sorted(KNOWN_TO_RENDER))} alone:{listed(wrong)}"
 
 
+def private_name(node: ast.AST) -> str | None:
+    """What a node names of Taichi's internals: a module, an attribute, or a variable of its environment."""
+    if isinstance(node, ast.Constant) and str(node.value).startswith(ENVIRONMENT):
+        return str(node.value)
+    if isinstance(node, ast.ImportFrom) and node.module == "taichi":
+        return next((each.name for each in node.names if is_submodule(each.name)), None)
+    if not isinstance(node, ast.Attribute):
+        return None
+    owner = ast.unparse(node.value).rpartition(".")[2].lstrip("_")
+    if owner in ("ti", "taichi") and (node.attr.startswith("_") or is_submodule(node.attr)):
+        return f"{owner}.{node.attr}"
+    return next((name for name in (node.attr, f"{owner}.{node.attr}") if name in PRIVATE), None)
+
+
+def is_submodule(name: str) -> bool:
+    """Whether ``ti`` has a module of a name that its documentation has not."""
+    return name not in PUBLIC_SUBMODULES and isinstance(getattr(taichi, name, None), ModuleType)
+
+
+def test_one_file_knows_the_internals_of_taichi():
+    imported = [
+        (each.file, each.line, each.name)
+        for each in imports()
+        if layer_of(each.name) == "taichi" and each.name not in PUBLIC_MODULES
+    ]
+    used = [(file, getattr(node, "lineno", 0), private_name(node)) for _, file, node in nodes()]
+    found = imported + [each for each in used if each[2] is not None]
+    known = {name for file, _, name in found if file == INTERNALS}
+    assert known >= PRIVATE, f"{INTERNALS} does not use {PRIVATE - known}: what is looked for here is wrong"
+    wrong = [
+        f"{file}:{line} uses {name}"
+        for file, line, name in found
+        if file != INTERNALS and not (file == BEFORE_IMPORT and str(name).startswith(ENVIRONMENT))
+    ]
+    assert not wrong, f"Taichi's internals belong to {INTERNALS}:{listed(wrong)}"
+
+
 def test_one_file_knows_the_window_library():
-    found = [str(each) for each in imports() if f"{each.name}.".startswith("taichi.ui.")]
-    found += [
+    found = [
         f"{file}:{node.lineno} uses {ast.unparse(node)}"
         for _, file, node in nodes()
         if isinstance(node, ast.Attribute) and ast.unparse(node) in ("ti.ui", "taichi.ui")
     ]
     wrong = [each for each in found if not each.startswith("render/window.py:")]
-    assert len(wrong) < len(found), (
-        "render/window.py does not use taichi.ui: what is looked for here is wrong"
-    )
-    assert not wrong, f"taichi.ui belongs to render/window.py:{listed(wrong)}"
+    assert len(wrong) < len(found), "render/window.py does not use ti.ui: what is looked for here is wrong"
+    assert not wrong, f"ti.ui belongs to render/window.py:{listed(wrong)}"
 
 
 def test_no_module_imports_itself_in_a_circle():

@@ -9,9 +9,9 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from sim.device import TASK
 from sim.fields import fill, zeros
 from sim.kernels import kernel
+from sim.taichi_internals import TASK
 from ultrasound.probe import Probe
 from ultrasound.pulse import DB_OF_NEPER, PATH_ENTRIES, PATH_STEP
 

@@ -14,9 +14,9 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from sim.device import TASK
 from sim.fields import array_of, fill, zeros
 from sim.kernels import kernel
+from sim.taichi_internals import TASK
 from ultrasound.beam import elevation_profiles, profile_depths
 from ultrasound.lateral_kernel import (
     CLASSES,

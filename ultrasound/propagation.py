@@ -11,9 +11,9 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from sim.device import TASK
 from sim.fields import array_of, fill, zeros
 from sim.kernels import kernel
+from sim.taichi_internals import TASK
 from ultrasound.acoustics import MAST_OFFSET, MAST_SLOPE, acoustic_values
 from ultrasound.aperture_rays import ApertureRays
 from ultrasound.beam import half_apertures_mm

@@ -9,9 +9,9 @@ The strengths are estimates, after images of atlases; the vibration in air is th
 import numpy as np
 import taichi as ti
 
-from sim.device import TASK
 from sim.fields import zeros
 from sim.kernels import kernel
+from sim.taichi_internals import TASK
 from ultrasound.probe import Probe
 from ultrasound.propagation import Propagation, speed_ratio
 from ultrasound.pulse import DB_OF_NEPER

@@ -12,7 +12,6 @@ import trimesh
 from matplotlib.figure import Figure
 from rehearsal.frame import image_view
 from rehearsal.open_window import initial_settings, probe_with_settings
-from taichi.profiler.kernel_profiler import get_default_kernel_profiler
 from tqdm import tqdm
 
 from rehearsal.build_solver import build_solver, embedding_cell_mm, static_shape
@@ -36,6 +35,7 @@ from sim.material import Part
 from sim.shape_matching import fill_organ
 from sim.shapes import ConvexTool
 from sim.solver import Solver
+from sim.taichi_internals import launched_kernels
 from studies.harness import build, memory_mb
 from studies.study_options import open_study, out_option, scene_argument
 from studies.study_results import finish_axes, table_of, write_results
@@ -233,9 +233,7 @@ def kernels_of(body: FeatureBody, options: Options, arch: str) -> dict[str, int]
         ti.profiler.clear_kernel_profiler_info()
         solver.step(body.settings, body.poses(0))
     ti.sync()
-    profiler = get_default_kernel_profiler()
-    profiler._update_records()
-    names = [record.name for record in profiler._traced_records]
+    names = launched_kernels()
     return dict(kernels=len(set(names)), launches=len(names))
 
 

@@ -206,6 +206,14 @@ def test_each_axis_may_have_any_length(device, shape):
             grid.fill_and_copy(wrong)
 
 
+def test_a_parameter_that_can_be_no_argument_is_refused():
+    def move(self, by: ti.types.vector(3, ti.i32)):
+        pass
+
+    with pytest.raises(TypeError, match="expected numbers, vectors, matrices or arrays"):
+        kernel(move)
+
+
 def test_fields_of_other_kinds_are_other_kernels(device):
     thing = Plain(np.zeros(3))
     thing.add(1.0)
