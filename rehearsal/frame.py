@@ -37,9 +37,10 @@ from render.window import Window
 from scenes.import_findings import acknowledge
 from scenes.scene import SceneError
 from ultrasound.doppler import scale_colours
+from ultrasound.persistence import Persistence
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane
-from ultrasound.scanner import B_MODE, IMAGES_OF_MODE
+from ultrasound.scanner import B_MODE, IMAGES_OF_MODE, PlaneImages, Scanner
 
 PREPARING = "PREPARING THE IMAGE"
 # How long a notice stays on the screen, and the one that the tissue's state was restored.
@@ -69,6 +70,7 @@ class Frames(Generic[Source]):
     resection_plan: ResectionPlan | None = None
     warnings: tuple[str, ...] = ()
     """Of the import, which nobody has acknowledged."""
+    persistence: Persistence = field(default_factory=Persistence, init=False)
     resection: ResectionView = field(init=False)
 
     def __post_init__(self) -> None:
@@ -93,7 +95,7 @@ class Frames(Generic[Source]):
     def image(self, probe: Probe, settings: Settings) -> View:
         """Compute the images of the probe at its present pose."""
         time_s = self.source.session.time_s
-        view = image_view(self.rehearsal, probe, settings, self.tally, None, time_s)
+        view = image_view(self.rehearsal, probe, settings, self.tally, None, time_s, self.persistence)
         return replace(self.with_resection(view, settings), warnings=self.import_warnings())
 
     def import_warnings(self) -> tuple[str, ...]:
@@ -280,7 +282,8 @@ class WindowFrames(Frames[WindowInput]):
             return self.cine.shown.view
         count, (width, depth, _) = len(IMAGES_OF_MODE[settings.mode]), probe.extent_mm
         shape = self.viewer.image_shape(count, width, depth) if self._only_shows else None
-        return image_view(self.rehearsal, probe, settings, self.tally, shape, self.source.session.time_s)
+        time_s = self.source.session.time_s
+        return image_view(self.rehearsal, probe, settings, self.tally, shape, time_s, self.persistence)
 
     @property
     def _only_shows(self) -> bool:
@@ -405,8 +408,7 @@ class WindowFrames(Frames[WindowInput]):
         probe = probe_with_settings(self.rehearsal.probe, settings)
         if self._only_shows and not self._shows_earlier:
             # With all pixels of the scene.
-            plain = replace(settings, persistence_percent=0)
-            whole = image_view(self.rehearsal, probe, plain, Tally(0.0), None, self.source.session.time_s)
+            whole = image_view(self.rehearsal, probe, settings, Tally(0.0), None, self.source.session.time_s)
             view = replace(view, images=whole.images, doppler=whole.doppler)
         begin, missing = save_view(view, probe, self.out), []
         if view.notes.keys() & view.images.keys():
@@ -426,22 +428,27 @@ def image_view(
     tally: Tally,
     shape: tuple[int, int] | None = None,
     time_s: float = 0.0,
+    persistence: Persistence | None = None,
 ) -> View:
     """Compute the images of the probe at its present pose, with overlays and read-outs, at a time of the session.
 
     ``shape`` are the rows and columns of the images, at most the scene's pixels each, which is also the default.
+    ``persistence`` is that of the images shown before; without it an image stands alone.
     """
     scanner, pixels = rehearsal.scanner, rehearsal.scene.image.pixels
     plane = image_plane(rehearsal.pose, probe.housing_mm[2], *probe.extent_mm)
     shown = settings.mode, settings.detail_level, settings.window_hu, settings.level_hu
 
-    def images() -> dict[str, np.ndarray]:
+    def images() -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         if scanner is None:
-            return {"no CT": np.zeros((pixels, pixels), np.uint8)}
+            return {"no CT": np.zeros((pixels, pixels), np.uint8)}, None
         shown_shape = shape and (min(shape[0], pixels), min(shape[1], pixels))
-        return scanner.images(plane, probe, *shown, shown_shape, settings.persistence_percent / 100)
+        made = scanner.images(plane, probe, *shown, shown_shape)
+        if persistence is not None:
+            made = persistence.mixed(made, settings.persistence_percent / 100)
+        return made.by_name, doppler_of(scanner, made, settings, time_s)
 
-    made, doppler = timed(lambda: with_doppler(rehearsal, probe, settings, images(), time_s), tally.slice_ms)
+    made, doppler = timed(images, tally.slice_ms)
     width, depth, above = probe.extent_mm
     return View(
         transducer_pose=rehearsal.pose,
@@ -462,18 +469,13 @@ def image_view(
     )
 
 
-def with_doppler(
-    rehearsal: Rehearsal,
-    probe: Probe,
-    settings: ScannerSettings,
-    images: dict[str, np.ndarray],
-    time_s: float,
-) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
-    """The images, and the B-mode image of them with Doppler over it; None where that is off."""
-    if rehearsal.scanner is None or settings.doppler == "off" or B_MODE not in images:
-        return images, None
-    given = images[B_MODE], settings.doppler, time_s, settings.clamped
-    return images, rehearsal.scanner.doppler(probe, *given)
+def doppler_of(
+    scanner: Scanner, images: PlaneImages, settings: ScannerSettings, time_s: float
+) -> np.ndarray | None:
+    """The B-mode image with Doppler over it; None where that is off."""
+    if settings.doppler == "off" or B_MODE not in images.by_name:
+        return None
+    return scanner.doppler(images, settings.doppler, time_s, settings.clamped)
 
 
 def scale_texts(probe: Probe, settings: ScannerSettings) -> tuple[str, str]:

@@ -36,7 +36,8 @@ from ultrasound.probe_manipulator import (
     image_plane,
     touching,
 )
-from ultrasound.scanner import ScannedAnatomy, Scanner, plane_section, shows_ct, start_acoustics
+from ultrasound.scanned_anatomy import ScannedAnatomy, start_acoustics
+from ultrasound.scanner import Scanner, plane_section, shows_ct
 
 # Where the tumour protrudes, organ and tumour share a surface: the tumour's is drawn this far outside.
 TUMOUR_LIFT_MM = 0.8
@@ -248,7 +249,8 @@ class Rehearsal(PressedOrgan):
         self.geometry_version += 1
         self.embedding.skin.attach_again()
         if self.scanner is not None:
-            self.scanner.set_crater(None if cut is None else Crater(cut.specimen, cut.settings.filling))
+            crater = None if cut is None else Crater(cut.specimen, cut.settings.filling)
+            self.scanner.volumes.set_crater(crater)
         if self._score_points is not None:
             self._score_points.attach_again()
 
