@@ -55,7 +55,7 @@ class AnatomyVolumes:
 
     @cached_property
     def organ(self) -> SampledVolume:
-        """Signed distance [mm] from the organ's surface, negative inside; fluid in a crater counts as inside."""
+        """Signed distance [mm] from the organ's surface, negative inside; a crater with fluid is inside."""
         return self._with_crater(distance_volume(self.anatomy.organ), _without_air)
 
     @cached_property
@@ -77,15 +77,16 @@ class AnatomyVolumes:
         self._replaced.clear()
         self.crater, self.version = crater, self.version + 1
         for volume, change in self._volumes:
-            self._change(volume, change)
+            self._apply(change, volume)
 
     def _with_crater(self, volume: SampledVolume, change: Change) -> SampledVolume:
         """Own a new volume: with the crater in it, if there is one, now and later."""
         self._volumes.append((volume, change))
-        self._change(volume, change)
+        self._apply(change, volume)
         return volume
 
-    def _change(self, volume: SampledVolume, change: Change) -> None:
+    def _apply(self, change: Change, volume: SampledVolume) -> None:
+        """Put the present crater into a volume without one."""
         changed = None if self.crater is None else change(self.crater, volume)
         if changed is not None:
             box, values = changed
@@ -94,7 +95,7 @@ class AnatomyVolumes:
 
 
 def flow_volume(voxels: TissueVoxels) -> SampledVolume:
-    """Return the blood flow, of ``blood_flow.CHANNELS``, along the axes in mm; none where there are no vessels."""
+    """Return the blood flow, of ``blood_flow.CHANNELS``, along the axes in mm; zero without vessels."""
     low, values = stored_flow(voxels)
     values = values.astype(np.float32)
     axes = np.linalg.inv(voxels.index_from_mm[:3, :3]) / voxels.spacing_mm

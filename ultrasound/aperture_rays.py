@@ -22,7 +22,7 @@ FINER = 4
 
 
 class ApertureRays:
-    """Rays to each of ``most`` samples of ``lines`` scanlines: fields (RAYS, scanlines, samples), at the rays' ends.
+    """Rays to each of ``most`` samples of ``lines`` scanlines: (RAYS, scanlines, samples) at their ends.
 
     ``amplitude`` and ``path`` [Np/MHz] are one way. ``refraction`` has the angle by which a ray is turned [rad], and its offset [scanlines].
     """

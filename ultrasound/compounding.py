@@ -9,7 +9,7 @@ from ultrasound.probe import DetailLevel, Probe
 
 
 class Compounding:
-    """The B-mode image ``straight`` and, for each further angle that a probe compounds, one of ``make_steered``.
+    """The B-mode image ``straight`` and, for each further angle of a probe, one of ``make_steered``.
 
     ``steered`` are those of the last image. They are memory alone: an image depends on none before it.
     """
@@ -19,7 +19,7 @@ class Compounding:
         self.steered: dict[float, BMode] = {}
 
     def render(self, probe: Probe, detail_level: DetailLevel) -> np.ndarray:
-        """Return the mean of all angles, where these reach: grey values (rows, columns) uint8 of the plane located last."""
+        """Return the mean (rows, columns) uint8 of all angles, where these reach, on the plane located last."""
         angles = probe.compound_angles_deg[1:]
         self.steered = {angle: self.steered.get(angle) or self._make_steered() for angle in angles}
         first = self.straight.render(probe, detail_level)

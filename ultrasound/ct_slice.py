@@ -1,4 +1,4 @@
-"""The CT slice on the image plane: image plane -> deformed tetrahedra -> voxels at rest (the paper's method)."""
+"""The CT slice: image plane -> deformed tetrahedra -> voxels at rest (the paper's method)."""
 
 import numpy as np
 import taichi as ti
@@ -12,8 +12,8 @@ from ultrasound.sampled_volume import LANES, SampledVolume
 class CTSlice:
     """The CT on the plane located last.
 
-    ``ct`` is HU, ``organ`` the signed distance from the organ's surface [mm], both at rest; ``outside_hu`` is shown
-    outside the organ, None for the CT there.
+    ``ct`` is HU, ``organ`` the signed distance from the organ's surface [mm], both at rest; ``outside_hu`` is
+    shown outside the organ, None for the CT there.
     """
 
     def __init__(

@@ -17,8 +17,8 @@ class Persistence:
     def mixed(self, images: PlaneImages, share: float) -> PlaneImages:
         """Return the images, their B-mode image with a share (0 to 1) of the mean before.
 
-        The mean begins anew where shape, probe or crater differ from those of the last image, and after images without
-        a share or without a B-mode image.
+        The mean begins anew where shape, probe or crater differ from those of the last image, and after
+        images without a share or without a B-mode image.
         """
         image = images.by_name.get(B_MODE)
         if image is None or share == 0.0:

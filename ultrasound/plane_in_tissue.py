@@ -16,8 +16,8 @@ from ultrasound.sampled_volume import LANES, Lanes
 class PlaneInTissue:
     """The tetrahedron of an embedding that contains each pixel of an image plane, which has at most ``pixels`` x ``pixels``.
 
-    Since the last ``locate``, number ``location``, the image has ``shape`` (rows, columns), ``owner`` is the tetrahedron's
-    index at these, and ``grid`` are the size of a pixel and the centre (u, v) of the first one [mm].
+    Since the last ``locate``, number ``location``, the image has ``shape`` (rows, columns), ``owner`` is the
+    tetrahedron's index at these, ``grid`` the size of a pixel and the centre (u, v) of the first one [mm].
     """
 
     def __init__(self, embedding: Embedding | Unmoved, pixels: int) -> None:

@@ -57,8 +57,8 @@ class Propagation:
     """Sound along the scanlines of a probe, at tissue samples ``stride_of`` scanline samples apart.
 
     ``tissue_volume`` (.., 4) has impedance, attenuation, backscatter and its anisotropy (``acoustics.properties``), ``organ`` the signed distance
-    from the organ's surface [mm], both at rest. An element transmits and receives only in contact: with the organ, nearer than
-    ``contact_gap_mm``, or, where ``contact`` is "tissue", with anything but gas.
+    from the organ's surface [mm], both at rest. An element transmits and receives only in contact: with the
+    organ, nearer than ``contact_gap_mm``, or, where ``contact`` is "tissue", with anything but gas.
     ``around`` is the impedance [MRayl] of all that is outside the organ; None for what the CT shows there. With ``has_fluid``, what a
     scanline passes from the array to the organ, nearer than ``contact_gap_mm`` all the way, is irrigation fluid, but no gas.
 

@@ -37,9 +37,9 @@ FALL_IN_AIR, LENS, BANDS = 9.4, 5.3, 0.27
 
 
 class Reverberation:
-    """Amplitude of scatter ``level`` (scanlines, samples) that reverberation adds at each tissue sample of ``sound``.
+    """Amplitude of scatter ``level`` (scanlines, samples) that reverberation adds to that of ``sound``.
 
-    ``path`` [Np/MHz] is that of ``sound`` or, where tissue is seen by way of gas, of the sound that reached the gas.
+    ``path`` [Np/MHz] is that of ``sound`` or, behind gas, that of what reached the gas.
     """
 
     def __init__(self, sound: Propagation) -> None:

@@ -15,9 +15,9 @@ from ultrasound.acoustics import TissueVoxels, stored_properties
 class ScannedAnatomy:
     """The anatomy at rest, all in one coordinate system [mm].
 
-    ``hu`` (nx, ny, nz) and ``labels`` on the same grid, with ``index_from_mm`` (4, 4); ``tissues`` are those by label.
-    ``classify`` returns the tissue of every voxel, on a grid of its own; without it, what has no label has the acoustic
-    properties of its HU.
+    ``hu`` (nx, ny, nz) and ``labels`` on the same grid, with ``index_from_mm`` (4, 4); ``tissues`` are those
+    by label. ``classify`` returns the tissue of every voxel, on a grid of its own; without it, what has no
+    label has the acoustic properties of its HU.
     """
 
     organ: trimesh.Trimesh

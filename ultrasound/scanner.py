@@ -1,4 +1,4 @@
-"""The scanner: CT slice, B-mode image, Doppler, signals and ground-truth labels of an anatomy on an image plane."""
+"""The scanner: CT slice, B-mode image, Doppler, signals and labels of an anatomy on a probe's image plane."""
 
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -39,8 +39,8 @@ IMAGES_OF_MODE: dict[Mode, tuple[str, ...]] = {"ct": (CT,), "b-mode": (B_MODE,),
 class PlaneImages:
     """The images of one plane, and what they show.
 
-    ``by_name`` has grey values (rows, columns) uint8, the main image first. ``version`` is that of the volumes,
-    ``location`` the number of the plane's location (``PlaneInTissue``).
+    ``by_name`` has grey values (rows, columns) uint8, the main image first. ``version`` is that of the
+    ``AnatomyVolumes``, ``location`` the number of the plane's location (``PlaneInTissue``).
     """
 
     by_name: dict[str, np.ndarray]
@@ -58,13 +58,13 @@ def shows_ct(outside: str) -> bool:
 class Scanner:
     """Images of at most ``pixels`` x ``pixels`` of an anatomy that an embedding deforms.
 
-    An image depends on its arguments, the volumes and the present embedding alone, on no image before it: all else that
-    is held are tables and memory of the modes. A mode is set up at its first image.
+    An image depends on its arguments, the volumes and the present embedding alone, on no image before it: all
+    else that is held are tables and memory of the modes. A mode is set up at its first image.
 
-    ``outside`` is what is shown outside the organ: ``background``, the CT around it, which deforms with the organ as far
-    as the embedding reaches; ``gel`` (0 HU); ``air`` (-1000 HU); ``fluid``, the CT, and sound passes through irrigation
-    fluid in the gap. ``contact`` and ``contact_gap_mm`` see ``Propagation``. ``acoustics`` are properties whose
-    computation has already been started. Raises TissueError.
+    ``outside`` is what is shown outside the organ: ``background``, the CT around it, which deforms with the
+    organ as far as the embedding reaches; ``gel`` (0 HU); ``air`` (-1000 HU); ``fluid``, the CT, and sound
+    passes through irrigation fluid in the gap. ``contact`` and ``contact_gap_mm`` see ``Propagation``.
+    ``acoustics`` are properties whose computation has already been started. Raises TissueError.
     """
 
     def __init__(
@@ -169,8 +169,8 @@ class Scanner:
     ) -> IQSignal:
         """Return IQ and RF signals of the B-mode image of the plane located last.
 
-        ``before`` is the plane of the image before, ``wavefront`` the reference of phases, with its number. Raises
-        ValueError for images of another plane.
+        ``before`` is the plane of the image before, ``wavefront`` the reference of phases, with its number.
+        Raises ValueError for images of another plane.
         """
         self._b_mode_of(images)
         probe = images.probe
