@@ -23,7 +23,8 @@ from sim.skinning import Interpolation, Skin
 from ultrasound.crater import Crater
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import ImagePlane
-from ultrasound.scanner import ScannedAnatomy, Scanner, plane_section, shows_ct, start_acoustics
+from ultrasound.scanned_anatomy import ScannedAnatomy, start_acoustics
+from ultrasound.scanner import Scanner, plane_section, shows_ct
 
 # Where the tumour protrudes, organ and tumour share a surface: the tumour's is drawn this far outside.
 TUMOUR_LIFT_MM = 0.8
@@ -89,7 +90,8 @@ class DeformedAnatomy:
         self.embedding.skin.attach_again()
         if self.scanner is not None:
             cut = geometry.cut
-            self.scanner.set_crater(None if cut is None else Crater(cut.specimen, cut.settings.filling))
+            crater = None if cut is None else Crater(cut.specimen, cut.settings.filling)
+            self.scanner.volumes.set_crater(crater)
 
     def skin(self, points: np.ndarray) -> Skin:
         """Points (n, 3) [mm] of the tissue at rest that move with it; ``update`` takes them to the present frame."""

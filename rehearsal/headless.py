@@ -1,6 +1,6 @@
 """A rehearsal without a screen: the scripted press, or a recorded session."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from render.viewer import Controls, Settings, View
 from render.window import NoVulkan, Window
 from scenes.atomic_files import atomic_write
 from scenes.terminal import bar
+from ultrasound.persistence import Persistence
 from ultrasound.probe import Probe
 
 # An animation is held in memory: a long session has fewer images in it.
@@ -91,6 +92,7 @@ class HeadlessLoop:
     link: OpenIGTLinkServer | None = None
     warnings: tuple[str, ...] = ()
     """Of the import, which nobody has acknowledged."""
+    _persistence: Persistence = field(default_factory=Persistence, init=False)
 
     def run(self, steps: int, out: Path, draws: bool) -> list[str]:
         """Make so many steps; return what was written of images."""
@@ -116,7 +118,7 @@ class HeadlessLoop:
 
     def _view(self, probe: Probe) -> View:
         """The images of the present frame, with the score and the coming cut."""
-        view = image_view(self.rehearsal.anatomy, probe, self.settings, self.tally.slice_ms)
+        view = image_view(self.rehearsal.anatomy, probe, self.settings, self.tally.slice_ms, None, self._persistence)
         view = replace(view, warnings=tuple(f"Import: {text}" for text in self.warnings))
         planned = cut_settings(self.settings)
         self.resection.update(planned, lambda points: self.measurements.coverage.is_seen(points))

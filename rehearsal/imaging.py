@@ -8,8 +8,9 @@ from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.stopwatch import timed
 from render.viewer import ScannerSettings, Settings, View
 from ultrasound.doppler import scale_colours
+from ultrasound.persistence import Persistence
 from ultrasound.probe import Probe
-from ultrasound.scanner import B_MODE
+from ultrasound.scanner import B_MODE, PlaneImages, Scanner
 
 # Figures of speed are medians of so many steps and images.
 RECENT = 30
@@ -21,29 +22,26 @@ def image_view(
     settings: Settings,
     ms: list[float] | None = None,
     shape: tuple[int, int] | None = None,
+    persistence: Persistence | None = None,
 ) -> View:
     """Compute the images of the probe at its present pose, with overlays; add the time that they took to ``ms``.
 
-    ``shape`` are the rows and columns of the images, at most the scene's pixels each, which is also the default.
+    ``shape`` are the rows and columns of the images, at most the scene's pixels each, which is also the default. ``persistence`` is that
+    of the images shown before; without it an image stands alone.
     """
     scanner, pixels = anatomy.scanner, anatomy.case.scene.image.pixels
     shown = settings.mode, settings.detail_level, settings.window_hu, settings.level_hu
 
-    def images() -> dict[str, np.ndarray]:
+    def images() -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         if scanner is None:
-            return {"no CT": np.zeros((pixels, pixels), np.uint8)}
+            return {"no CT": np.zeros((pixels, pixels), np.uint8)}, None
         shown_shape = shape and (min(shape[0], pixels), min(shape[1], pixels))
-        plane = anatomy.image_plane(probe)
-        return scanner.images(plane, probe, *shown, shown_shape, settings.persistence_percent / 100)
+        made = scanner.images(anatomy.image_plane(probe), probe, *shown, shown_shape)
+        if persistence is not None:
+            made = persistence.mixed(made, settings.persistence_percent / 100)
+        return made.by_name, doppler_of(scanner, made, settings, anatomy.frame.time_s)
 
-    def with_doppler() -> tuple[dict[str, np.ndarray], np.ndarray | None]:
-        made = images()
-        if scanner is None or settings.doppler == "off" or B_MODE not in made:
-            return made, None
-        given = made[B_MODE], settings.doppler, anatomy.frame.time_s, settings.clamped
-        return made, scanner.doppler(probe, *given)
-
-    made, doppler = timed(with_doppler, [] if ms is None else ms)
+    made, doppler = timed(images, [] if ms is None else ms)
     width, depth, above = probe.extent_mm
     return View(
         transducer_pose=anatomy.pose,
@@ -61,6 +59,15 @@ def image_view(
         captions=captions(probe, settings),
         title=anatomy.case.scene.title,
     )
+
+
+def doppler_of(
+    scanner: Scanner, images: PlaneImages, settings: ScannerSettings, time_s: float
+) -> np.ndarray | None:
+    """The B-mode image with Doppler over it; None where that is off."""
+    if settings.doppler == "off" or B_MODE not in images.by_name:
+        return None
+    return scanner.doppler(images, settings.doppler, time_s, settings.clamped)
 
 
 def scale_texts(probe: Probe, settings: ScannerSettings) -> tuple[str, str]:

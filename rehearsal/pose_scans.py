@@ -18,7 +18,7 @@ from ultrasound.bmode import Wavefront
 from ultrasound.iq_signal import save_iq
 from ultrasound.probe import DopplerMode, Probe
 from ultrasound.probe_manipulator import ImagePlane
-from ultrasound.scanner import B_MODE, DOPPLER, Scanner
+from ultrasound.scanner import DOPPLER, PlaneImages, Scanner
 from ultrasound.sweep_file import LabelledSweep
 
 FRAMES_PER_SECOND = 30
@@ -64,8 +64,8 @@ class PoseScans:
         if self._sweep is not None:
             self._sweep.close()
 
-    def images(self, pose: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the images of a pose (4, 4) by their names."""
+    def images(self, pose: np.ndarray) -> PlaneImages:
+        """Return the images of a pose (4, 4)."""
         began = perf_counter()
         self._planes.append(ImagePlane(pose, *self.probe.extent_mm))
         shown = (
@@ -79,30 +79,29 @@ class PoseScans:
         labels = self.scanner.ground_truth.render()
         self.empty += not labels.any()
         if self._sweep is not None:
-            grey = next(iter(images.values()))
+            grey = next(iter(images.by_name.values()))
             self._sweep.add(grey, labels, self.probe, pose, self._sweep.count / FRAMES_PER_SECOND)
         return images
 
-    def save_iq(self, name: str, suffix: str) -> None:
-        """Write the IQ and RF signals of the last B-mode image. Raises OSError."""
-        before, plane = self._planes[-2] if len(self._planes) > 1 else None, self._planes[-1]
-        world = np.asarray(plane.world_from_plane, float)
+    def save_iq(self, name: str, images: PlaneImages, suffix: str) -> None:
+        """Write the IQ and RF signals of the last pose's B-mode image. Raises OSError."""
+        before = self._planes[-2] if len(self._planes) > 1 else None
+        world = np.asarray(images.plane.world_from_plane, float)
         if not self._wavefronts or self._wavefronts[-1].angle_deg(self.probe, world) > MOST_TURNED_DEG:
             self._wavefronts.append(Wavefront.of(self.probe, world))
         reference = self._wavefronts[-1], len(self._wavefronts) - 1
-        signals = self.scanner.iq(self.probe, plane, before, *reference)
+        signals = self.scanner.iq(images, before, *reference)
         with atomic_write(self.out / f"{name}-iq.{suffix}") as partial:
             save_iq(signals, partial, suffix)
 
     def with_doppler(
-        self, images: dict[str, np.ndarray], mode: DopplerMode, clamped: bool = False
+        self, images: PlaneImages, mode: DopplerMode, clamped: bool = False
     ) -> dict[str, np.ndarray]:
-        """Return the images, with Doppler of the last B-mode image at the peak of systole."""
-        shown = self.scanner.doppler(self.probe, images[B_MODE], mode, SYSTOLE_S, clamped)
-        return images | {DOPPLER: shown}
+        """Return the last pose's images by their names, with Doppler at the peak of systole."""
+        return images.by_name | {DOPPLER: self.scanner.doppler(images, mode, SYSTOLE_S, clamped)}
 
     def save(self, name: str, images: dict[str, np.ndarray], dicom: bool) -> None:
-        """Write the images of the last pose, and note them in ``rows``. Raises OSError."""
+        """Write the last pose's images by their names, and note them in ``rows``. Raises OSError."""
         prefix = self.out / name
         for each in save_images(images, *self.probe.extent_mm[:2], self.probe, prefix, dicom):
             self.rows.append(

@@ -23,6 +23,7 @@ from rehearsal.settings import probe_with_settings, set_settings
 from rehearsal.window_panel import WindowPanel
 from render.viewer import Controls, ScannerSettings, View
 from render.window import Window
+from ultrasound.persistence import Persistence
 from ultrasound.probe import Probe
 from ultrasound.scanner import IMAGES_OF_MODE
 
@@ -48,6 +49,7 @@ class WindowLoop:
     panel: WindowPanel
     times: FrameTimes = field(default_factory=FrameTimes)
     frozen: bool = False
+    _persistence: Persistence = field(default_factory=Persistence, init=False)
     _image_ms: list[float] = field(default_factory=list, init=False)
     _input_at_s: float | None = field(default=None, init=False)
     _version: int = field(default=0, init=False)
@@ -130,7 +132,7 @@ class WindowLoop:
         settings = controls.settings
         count, (width, depth, _) = len(IMAGES_OF_MODE[settings.mode]), probe.extent_mm
         shape = self.window.image_shape(count, width, depth) if self.panel.only_shows else None
-        view = image_view(self.anatomy, probe, settings, self._image_ms, shape)
+        view = image_view(self.anatomy, probe, settings, self._image_ms, shape, self._persistence)
         del self._image_ms[:-MOST_TIMES]
         return view
 

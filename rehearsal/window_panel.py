@@ -217,7 +217,7 @@ class WindowPanel:
         probe = probe_with_settings(self.anatomy.case.probe, settings)
         if self.only_shows and not self.shows_earlier:
             # With all pixels of the scene.
-            whole = image_view(self.anatomy, probe, replace(settings, persistence_percent=0))
+            whole = image_view(self.anatomy, probe, settings)
             view = replace(view, images=whole.images, doppler=whole.doppler)
         begin, missing = save_view(view, probe, self.out), []
         if view.notes.keys() & view.images.keys():

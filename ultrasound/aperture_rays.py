@@ -3,8 +3,6 @@
 A shadow is soft where a part of the aperture sees past an obstacle, and beside a round one where refraction moves the rays apart.
 """
 
-from typing import Any
-
 import numpy as np
 import taichi as ti
 import taichi.math as tm
@@ -24,21 +22,20 @@ FINER = 4
 
 
 class ApertureRays:
-    """Rays through the tissue of a ``Propagation``, each (RAYS, scanlines, samples), at their ends on the scanlines.
+    """Rays to each of ``most`` samples of ``lines`` scanlines: (RAYS, scanlines, samples) at their ends.
 
     ``amplitude`` and ``path`` [Np/MHz] are one way. ``refraction`` has the angle by which a ray is turned [rad], and its offset [scanlines].
     """
 
-    def __init__(self, sound: Any) -> None:
-        self.sound = sound
-        shape = RAYS, sound.lines, sound.most
+    def __init__(self, lines: int, most: int) -> None:
+        self.lines, shape = lines, (RAYS, lines, most)
         self.amplitude, self.path = (zeros(*shape) for _ in range(2))
         self.refraction = zeros(*shape, 2, within=1)
         # How many scanlines a ray is from its end at a sample, where it leaves the face. It goes from scanline to scanline: mixing
         # two would spread shadows.
-        self.offset = zeros(RAYS, sound.most, kind=ti.i32)
+        self.offset = zeros(RAYS, most, kind=ti.i32)
         # Scanlines per mm; half of the Fresnel zone in scanlines.
-        self.lines_per_mm, self.zone = zeros(sound.most), zeros(sound.most, kind=ti.i32)
+        self.lines_per_mm, self.zone = zeros(most), zeros(most, kind=ti.i32)
         self.one_way = zeros(FINER * PATH_ENTRIES)
 
     def set_probe(self, probe: Probe, depth_mm: np.ndarray) -> None:
@@ -53,56 +50,77 @@ class ApertureRays:
         )
 
     @kernel
-    def follow(self, count: int):
-        """Follow each ray to the samples of all scanlines: amplitude, one way, and attenuation of its path [Np/MHz]."""
+    def follow(
+        self,
+        contact: ti.template(),
+        tissue: ti.template(),
+        depth: ti.template(),
+        passed: ti.template(),
+        turn: ti.template(),
+        count: int,
+    ):
+        """Follow each ray to the samples of all scanlines, through the tissue of ``Propagation``."""
         for n in range(RAYS * TASK):
             if n % TASK == 0:
                 ray = n // TASK
-                for line in range(self.sound.lines):
-                    self.amplitude[ray, line, 0] = self.sound.contact[line]
+                for line in range(self.lines):
+                    self.amplitude[ray, line, 0] = contact[line]
                     self.path[ray, line, 0] = 0.0
                     self.refraction[ray, line, 0] = tm.vec2(0.0)
                 for k in range(1, count):
                     aside = self.offset[ray, k] - self.offset[ray, k - 1]
-                    for line in range(self.sound.lines):
-                        self.follow_ray(ray, line, k, tm.clamp(line - aside, 0, self.sound.lines - 1))
+                    for line in range(self.lines):
+                        from_line = tm.clamp(line - aside, 0, self.lines - 1)
+                        self.follow_ray(tissue, depth, passed, turn, ray, line, k, from_line)
 
     @ti.func
-    def follow_ray(self, ray, line, k, from_line):
+    def follow_ray(
+        self,
+        tissue: ti.template(),
+        depth: ti.template(),
+        passed: ti.template(),
+        turn: ti.template(),
+        ray,
+        line,
+        k,
+        from_line,
+    ):
         """Continue a ray from the sample before, on a scanline."""
-        attenuation = 0.5 * (self.sound.tissue[line, k - 1].y + self.sound.tissue[line, k].y)
-        step_mm = self.sound.depth[line, k] - self.sound.depth[line, k - 1]
+        attenuation = 0.5 * (tissue[line, k - 1].y + tissue[line, k].y)
+        step_mm = depth[line, k] - depth[line, k - 1]
         path = self.path[ray, from_line, k - 1]
         self.path[ray, line, k] = path + attenuation * step_mm / (10.0 * DB_OF_NEPER)
-        self.amplitude[ray, line, k] = self.amplitude[ray, from_line, k - 1] * self.sound.passed[line, k]
+        self.amplitude[ray, line, k] = self.amplitude[ray, from_line, k - 1] * passed[line, k]
         refraction = self.refraction[ray, from_line, k - 1]
-        turned = refraction.x + self.sound.turn[line, k]
+        turned = refraction.x + turn[line, k]
         self.refraction[ray, line, k] = tm.vec2(
             turned, refraction.y + turned * step_mm * self.lines_per_mm[k]
         )
 
     @kernel
-    def combine(self, count: int):
+    def combine(
+        self, build_up: ti.template(), count: int, round_trip: ti.template(), round_trip_path: ti.template()
+    ):
         """Write amplitude and path of the round trip: the mean over the rays that start on the array, squared."""
-        for line, k in ti.ndrange(self.sound.lines, count):
+        for line, k in ti.ndrange(self.lines, count):
             total, path, found = 0.0, 0.0, 0.0
             for ray in ti.static(range(RAYS)):
                 origin = line - self.offset[ray, k]
-                if origin >= 0 and origin < self.sound.lines:
+                if origin >= 0 and origin < self.lines:
                     along = self.path[ray, line, k]
                     one_way = self.amplitude[ray, line, k] * self.attenuated(along)
                     one_way *= self.focusing(ray, line, k)
                     total += one_way
                     path += one_way * along
                     found += 1.0
-            self.sound.amplitude[line, k] = self.sound.build_up[k] * (total / found) ** 2
-            self.sound.path[line, k] = 2.0 * path / ti.max(total, 1e-30)
+            round_trip[line, k] = build_up[k] * (total / found) ** 2
+            round_trip_path[line, k] = 2.0 * path / ti.max(total, 1e-30)
 
     @ti.func
     def focusing(self, ray, line, k):
         """Return the factor of amplitude of rays that refraction has moved together or apart, over a Fresnel zone."""
         zone = self.zone[k]
-        low, high = ti.max(line - zone, 0), ti.min(line + zone, self.sound.lines - 1)
+        low, high = ti.max(line - zone, 0), ti.min(line + zone, self.lines - 1)
         further = self.refraction[ray, high, k].y - self.refraction[ray, low, k].y
         apart = 1.0 + further / ti.max(high - low, 1)
         return 1.0 / ti.sqrt(tm.clamp(apart, 1.0 / MOST_FOCUSED, MOST_FOCUSED))

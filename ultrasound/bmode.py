@@ -132,7 +132,8 @@ class BMode:
             self._lengthen(stride, speckle_sd, probe.sample_mm)
         else:
             self._scatter_evenly(stride)
-        self._reflect(has_speckle, stride, probe.sample_mm, speckle_sd, look)
+        path = self.reverberation.path if has_speckle else self.sound.path
+        self._reflect(path, has_speckle, stride, probe.sample_mm, speckle_sd, look)
         if has_speckle:
             self.spread(10.0 ** (probe.noise_before_gain_db / 20.0), self.plane.noise_key, False)
         else:
@@ -149,7 +150,10 @@ class BMode:
         """Return the IQ signal (scanlines, samples) complex64 of the image rendered last, and rest positions (.., 3) [mm] of its samples.
 
         Its phase is that of the carrier: it turns with the distance of the tissue from the array, so that motion can be measured.
+        ``real``, ``imaginary`` and ``decibel`` stay as they are.
         """
+        signal = self.real, self.imaginary, self.decibel
+        before = [array_of(each) for each in signal]
         stride = self.sound.stride_of(probe)
         rest = np.empty((self.lines, self.samples, 3), np.float32)
         turn = 4 * np.pi / probe.wavelength_mm
@@ -158,6 +162,7 @@ class BMode:
             stride, probe.sample_mm, turn, wavefront.is_flat, apex, direction, wavefront.radius_mm, rest
         )
         self.spread(10.0 ** (probe.noise_before_gain_db / 20.0), self.plane.noise_key, True)
+        fill(*zip(signal, before, strict=True))
         return array_of(self.iq) @ np.array([1, 1j], np.complex64), rest
 
     @kernel
@@ -294,7 +299,7 @@ class BMode:
         """Lengthen the pulse as attenuation on the path has done, and scale speckle for the spread that follows."""
         for packet, line in ti.ndrange(self.samples // LANES, self.lines):
             first = packet * LANES
-            path = self.sound.path[line, (first + LANES // 2) // stride]
+            path = self.reverberation.path[line, (first + LANES // 2) // stride]
             more = (
                 ti.sqrt(ti.max(self.sound.at_path(self.speckle_sd, path) ** 2 - speckle_sd**2, 0.0))
                 / sample_mm
@@ -318,13 +323,14 @@ class BMode:
     @kernel
     def _reflect(
         self,
+        path: ti.template(),
         has_speckle: ti.template(),
         stride: ti.template(),
         sample_mm: float,
         speckle_sd: float,
         look: int,
     ):
-        """Add the echoes of the interfaces."""
+        """Add the echoes of the interfaces, after the sound's path [Np/MHz] to each tissue sample."""
         for n in range(self.lines * TASK):
             if n % TASK == 0:
                 for k in range(1, self.samples // stride + 1):
@@ -332,6 +338,7 @@ class BMode:
                         echo = (self.sound.echo, self.sound.capsule)[kind][n // TASK, k]
                         if echo.z > 0.0:
                             self.reflect(
+                                path,
                                 has_speckle,
                                 n // TASK,
                                 k,
@@ -343,13 +350,24 @@ class BMode:
                             )
 
     @ti.func
-    def reflect(self, has_speckle: ti.template(), line, k, echo, step_mm, sample_mm, speckle_sd, look):
+    def reflect(
+        self,
+        path: ti.template(),
+        has_speckle: ti.template(),
+        line,
+        k,
+        echo,
+        step_mm,
+        sample_mm,
+        speckle_sd,
+        look,
+    ):
         """Add an echo in front of a tissue sample: as long as the pulse."""
-        amplitude, path = self.sound.echo_amplitude(line, echo, step_mm)
+        amplitude, own_path = self.sound.echo_amplitude(path, line, echo, step_mm)
         diffuse, sd = tm.vec2(0.0, 0.0), self.axial_sd[0]
         if ti.static(has_speckle):
             diffuse = amplitude * echo.y * self.speckle_at(line, echo.z / step_mm, speckle_sd, look)
-            sd = self.sound.at_path(self.axial_sd, path)
+            sd = self.sound.at_path(self.axial_sd, own_path)
             mirror = ti.abs(amplitude * echo.x)
             if mirror > LEAST_REPEATED:
                 # Once more by way of the face.

@@ -1,7 +1,5 @@
 """Ground-truth labels of an image: organ, tumour and beads at each pixel."""
 
-from typing import Any
-
 import numpy as np
 import taichi as ti
 
@@ -30,8 +28,8 @@ class GroundTruthLabels:
         radius_mm: float = 2.0,
     ) -> None:
         self.plane, self.organ, self.radius_mm = plane, organ, radius_mm
-        self.tumour: Any = tumour
-        self.has_tumour = tumour is not None
+        # Without a tumour, no kernel reads its distances.
+        self.tumour, self.has_tumour = tumour or organ, tumour is not None
         self.beads, self.has_beads = 0 if beads is None else len(beads), beads is not None
         if self.beads > MAX_BEADS:
             raise ValueError(f"{self.beads} beads: at most {MAX_BEADS} fit into 8-bit labels")

@@ -16,8 +16,8 @@ from ultrasound.sampled_volume import LANES, Lanes
 class PlaneInTissue:
     """The tetrahedron of an embedding that contains each pixel of an image plane, which has at most ``pixels`` x ``pixels``.
 
-    Since the last ``locate`` the image has ``shape`` (rows, columns), ``owner`` is the tetrahedron's index at these, and ``grid`` are the
-    size of a pixel and the centre (u, v) of the first one [mm].
+    Since the last ``locate``, number ``location``, the image has ``shape`` (rows, columns), ``owner`` is the
+    tetrahedron's index at these, ``grid`` the size of a pixel and the centre (u, v) of the first one [mm].
     """
 
     def __init__(self, embedding: Embedding | Unmoved, pixels: int) -> None:
@@ -32,10 +32,17 @@ class PlaneInTissue:
         self._rest_grids: dict[int, np.ndarray] = {}
         # Changes with the plane: electronic noise is still only where the probe is.
         self.noise_key = 0
+        self.location = 0
 
     def locate(self, plane: ImagePlane, shape: tuple[int, int] | None = None) -> None:
-        """Find the tissue on a plane, for an image of a shape [all pixels]; the embedding must be up to date."""
-        rows, columns = self.shape = shape or (self.pixels, self.pixels)
+        """Find the tissue on a plane, for an image of a shape [all pixels]; the embedding must be up to date.
+
+        Raises ValueError for a shape of more pixels than there are.
+        """
+        rows, columns = shape or (self.pixels, self.pixels)
+        if max(rows, columns) > self.pixels:
+            raise ValueError(f"an image of {rows} x {columns} pixels: at most {self.pixels} each way")
+        self.shape, self.location = (rows, columns), self.location + 1
         size, corner = (
             np.array([plane.width_mm, plane.depth_mm]),
             np.array([-plane.width_mm / 2, -plane.above_mm]),

@@ -6,7 +6,7 @@ plane are (u, v) [mm]: u to the marked side, v down into the tissue, the origin 
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -312,19 +312,19 @@ def load_probe(name: str) -> Probe:
         raise ProbeError(f"{path}: {error}") from None
 
 
-def probe_of_values(values: Mapping[str, Any]) -> Probe:
+def probe_of_values(values: Mapping[str, object]) -> Probe:
     """Return the probe of a file's values. Raises ProbeError, which names the key."""
     for key in FORMER_KEYS.keys() & values.keys():
         raise ProbeError(f"{key} no longer exists; delete it ({FORMER_KEYS[key]} sets the same)")
     return _validated(values)
 
 
-def changed_probe(probe: Probe, **changes: Any) -> Probe:
+def changed_probe(probe: Probe, **changes: object) -> Probe:
     """Return a probe with some fields changed. Raises ProbeError where they do not fit together."""
     return _validated(probe.model_dump() | changes)
 
 
-def _validated(values: Mapping[str, Any]) -> Probe:
+def _validated(values: Mapping[str, object]) -> Probe:
     try:
         return Probe.model_validate(values)
     except ValidationError as error:

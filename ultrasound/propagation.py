@@ -5,8 +5,6 @@
 3. ``ApertureRays``: the amplitude that arrives at each sample, along several rays from the aperture.
 """
 
-from typing import Any
-
 import numpy as np
 import taichi as ti
 import taichi.math as tm
@@ -26,6 +24,7 @@ from ultrasound.interface import (
     diffuse,
     specular,
 )
+from ultrasound.plane_in_tissue import PlaneInTissue
 from ultrasound.probe import BUILD_UP_MM, Probe
 from ultrasound.pulse import DB_OF_NEPER, PATH_ENTRIES, PATH_STEP, SOUND_MM_US
 from ultrasound.sampled_volume import SampledVolume
@@ -58,8 +57,8 @@ class Propagation:
     """Sound along the scanlines of a probe, at tissue samples ``stride_of`` scanline samples apart.
 
     ``tissue_volume`` (.., 4) has impedance, attenuation, backscatter and its anisotropy (``acoustics.properties``), ``organ`` the signed distance
-    from the organ's surface [mm], both at rest; ``plane`` is a ``PlaneInTissue``. An element transmits and receives
-    only in contact: with the organ, nearer than ``contact_gap_mm``, or, where ``contact`` is "tissue", with anything but gas.
+    from the organ's surface [mm], both at rest. An element transmits and receives only in contact: with the
+    organ, nearer than ``contact_gap_mm``, or, where ``contact`` is "tissue", with anything but gas.
     ``around`` is the impedance [MRayl] of all that is outside the organ; None for what the CT shows there. With ``has_fluid``, what a
     scanline passes from the array to the organ, nearer than ``contact_gap_mm`` all the way, is irrigation fluid, but no gas.
 
@@ -74,7 +73,7 @@ class Propagation:
         self,
         tissue_volume: SampledVolume,
         organ: SampledVolume,
-        plane: Any,
+        plane: PlaneInTissue,
         probe: Probe,
         voxel_mm: float,
         contact: str = "organ",
@@ -105,7 +104,7 @@ class Propagation:
         # Half angle of the aperture across the plane [rad]; of interfaces: amplitudes reflected as a mirror and diffusely, slope,
         # amplitudes scattered evenly by soft and by hard ones.
         self.reflection = zeros(6)
-        self.rays = ApertureRays(self)
+        self.rays = ApertureRays(self.lines, self.most)
 
     def stride_of(self, probe: Probe) -> int:
         """Return the scanline samples between two tissue samples."""
@@ -154,8 +153,8 @@ class Propagation:
             fill((self.contact, np.full(self.lines, array_of(self.contact).mean())))
         self._sample(thick, count, stride * probe.sample_mm)
         self._find_interfaces(count, stride * probe.sample_mm)
-        self.rays.follow(count)
-        self.rays.combine(count)
+        self.rays.follow(self.contact, self.tissue, self.depth, self.passed, self.turn, count)
+        self.rays.combine(self.build_up, count, self.amplitude, self.path)
 
     @kernel
     def _find_contact(self):
@@ -341,18 +340,18 @@ class Propagation:
         return tm.mix(table[first], table[first + 1], at - first)
 
     @ti.func
-    def echo_amplitude(self, line, echo, step_mm):
+    def echo_amplitude(self, path: ti.template(), line, echo, step_mm):
         """Return the amplitude of a perfect reflector at an interface, and its path [Np/MHz].
 
-        The tissue before the interface attenuates up to its depth.
+        ``path`` is that of the tissue samples. The tissue before the interface attenuates up to its depth.
         """
         k = ti.cast(echo.w, ti.i32)
-        before = self.path[line, k]
+        before = path[line, k]
         further_mm = ti.max(echo.z - k * step_mm, 0.0) * speed_ratio(self.tissue[line, k].x)
-        path = before + 2.0 * self.tissue[line, k].y * further_mm / (10.0 * DB_OF_NEPER)
+        whole = before + 2.0 * self.tissue[line, k].y * further_mm / (10.0 * DB_OF_NEPER)
         # ``amplitude`` is that of speckle.
-        more_db = self.at_path(self.echo_db, path) - self.at_path(self.speckle_db, before)
-        return self.amplitude[line, k] * ti.exp(more_db / DB_OF_NEPER), path
+        more_db = self.at_path(self.echo_db, whole) - self.at_path(self.speckle_db, before)
+        return self.amplitude[line, k] * ti.exp(more_db / DB_OF_NEPER), whole
 
 
 @ti.func

@@ -37,15 +37,18 @@ FALL_IN_AIR, LENS, BANDS = 9.4, 5.3, 0.27
 
 
 class Reverberation:
-    """Amplitude of scatter ``level`` (scanlines, samples) that reverberation adds at each tissue sample of ``sound``."""
+    """Amplitude of scatter ``level`` (scanlines, samples) that reverberation adds to that of ``sound``.
+
+    ``path`` [Np/MHz] is that of ``sound`` or, behind gas, that of what reached the gas.
+    """
 
     def __init__(self, sound: Propagation) -> None:
         self.sound = sound
-        self.level = zeros(sound.lines, sound.most)
+        self.level, self.path = (zeros(sound.lines, sound.most) for _ in range(2))
 
     @kernel
     def run(self, count: int, step_mm: float):
-        """Set ``level`` after ``sound`` ran."""
+        """Set ``level`` and ``path`` after ``sound`` ran."""
         for n in range(self.sound.lines * TASK):
             if n % TASK == 0:
                 self.run_scanline(n // TASK, count, step_mm)
@@ -54,6 +57,7 @@ class Reverberation:
     def run_scanline(self, line, count, step_mm):
         for k in range(count):
             self.level[line, k] = 0.0
+            self.path[line, k] = self.sound.path[line, k]
         gas = 0
         for k in range(1, count):
             echo, behind = self.sound.echo[line, k], self.sound.tissue[line, k].x
@@ -86,7 +90,7 @@ class Reverberation:
             seen *= self.sound.tissue[line, there].z
             fall_db = BUBBLE_FALL_DB_MM * (k - gas) * step_mm
             self.level[line, k] += seen + bubble * ti.exp(-fall_db / DB_OF_NEPER)
-            self.sound.path[line, k] = path
+            self.path[line, k] = path
 
     @ti.func
     def has_bubble(self, rest):

@@ -94,10 +94,11 @@ def scan(asked: ScanOptions) -> None:
         for name, pose in tqdm(pose_by_name.items(), desc="scan", unit="pose"):
             images = scans.images(pose)
             if asked.iq is not None:
-                scans.save_iq(name, asked.iq)
+                scans.save_iq(name, images, asked.iq)
+            by_name = images.by_name
             if asked.doppler != "off":
-                images = scans.with_doppler(images, asked.doppler, asked.clamped)
-            scans.save(name, images, asked.dicom)
+                by_name = scans.with_doppler(images, asked.doppler, asked.clamped)
+            scans.save(name, by_name, asked.dicom)
     report = dict(
         version=VERSION,
         probe=scan_probe.model_dump(by_alias=True),

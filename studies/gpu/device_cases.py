@@ -19,6 +19,7 @@ from studies.performance.tradeoff import EMBEDDED_CASE
 
 if TYPE_CHECKING:
     from rehearsal.rehearsal import Rehearsal
+    from ultrasound.scanner import PlaneImages
 
 # A press of the embedded patient's beads, shorter than the paper's: what is compared is one device with another.
 WARM_UP_STEPS, STAGE_STEPS = 60, 30
@@ -98,7 +99,10 @@ def pictures() -> Iterator[CaseFigures]:
     """The B-mode image of the embedded patient's bent tissue."""
     start_s = perf_counter()
     rehearsal = _bent()
-    image = partial(_b_mode, rehearsal)
+
+    def image() -> np.ndarray:
+        return _images(rehearsal).by_name["B-mode"]
+
     yield _repeated("B-mode", start_s, image, PICTURES, rows_columns=list(image().shape))
 
 
@@ -106,9 +110,9 @@ def doppler() -> Iterator[CaseFigures]:
     """Colour Doppler over the same image."""
     start_s = perf_counter()
     rehearsal = _bent()
-    grey = _b_mode(rehearsal)
-    image = partial(rehearsal.scanner.doppler, rehearsal.probe, grey, "colour")  # type: ignore[union-attr]
-    yield _repeated("Doppler", start_s, image, PICTURES, rows_columns=list(grey.shape))
+    images = _images(rehearsal)
+    image = partial(rehearsal.scanner.doppler, images, "colour")  # type: ignore[union-attr]
+    yield _repeated("Doppler", start_s, image, PICTURES, rows_columns=list(images.by_name["B-mode"].shape))
 
 
 def frames() -> Iterator[CaseFigures]:
@@ -159,11 +163,11 @@ def _bent() -> "Rehearsal":
     return rehearsal
 
 
-def _b_mode(rehearsal: "Rehearsal") -> np.ndarray:
+def _images(rehearsal: "Rehearsal") -> "PlaneImages":
     image, scanner = rehearsal.scene.image, rehearsal.scanner
     assert scanner is not None
     shown = image.detail_level, image.window_hu, image.level_hu
-    return scanner.images(rehearsal.image_plane(), rehearsal.probe, "b-mode", *shown)["B-mode"]
+    return scanner.images(rehearsal.image_plane(), rehearsal.probe, "b-mode", *shown)
 
 
 def sizes(arch: str) -> Iterator[CaseFigures]:

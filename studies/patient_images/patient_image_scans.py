@@ -18,7 +18,8 @@ from studies.patient_images.standard_planes import standard_planes
 from ultrasound.acoustics import TissueVoxels
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import ImagePlane
-from ultrasound.scanner import B_MODE, CT, ScannedAnatomy, Scanner
+from ultrasound.scanned_anatomy import ScannedAnatomy
+from ultrasound.scanner import B_MODE, CT, Scanner
 
 PIXELS = 512
 # Side of the square over which speckle is averaged.
@@ -81,7 +82,8 @@ class ImagedPatient:
 
     def _scan(self, scanner: Scanner, probe: Probe, name: str, pose: np.ndarray) -> PlaneScan:
         plane, image = ImagePlane(pose, *probe.extent_mm), self.scene.image
-        images = scanner.images(plane, probe, "both", image.detail_level, image.window_hu, image.level_hu)
+        shown = image.detail_level, image.window_hu, image.level_hu
+        images = scanner.images(plane, probe, "both", *shown).by_name
         return PlaneScan(
             name,
             pose,

@@ -10,7 +10,7 @@ from sim.signed_distance import distance_grid
 from ultrasound.acoustics import KIDNEY
 from ultrasound.probe import Probe
 from ultrasound.sampled_volume import AIR_HU, FAR_MM
-from ultrasound.scanner import ScannedAnatomy
+from ultrasound.scanned_anatomy import ScannedAnatomy
 
 LESIONS = ("tumour", "cyst", "stone")
 PARENCHYMA = ("kidney", "cortex", "medulla")

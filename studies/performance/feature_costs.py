@@ -39,9 +39,11 @@ from sim.taichi_internals import launched_kernels
 from studies.harness import build, memory_mb
 from studies.study_options import open_study, out_option, scene_argument
 from studies.study_results import finish_axes, table_of, write_results
+from ultrasound.persistence import Persistence
 from ultrasound.probe import DetailLevel, DopplerMode, Mode, Probe
 from ultrasound.probe_manipulator import ImagePlane, advanced, image_plane, pose_at, poses_between, touching
-from ultrasound.scanner import ScannedAnatomy, Scanner, shows_ct
+from ultrasound.scanned_anatomy import ScannedAnatomy
+from ultrasound.scanner import PlaneImages, Scanner, shows_ct
 
 # Depth and steps of the press, and the steps before it in which the body settles.
 PRESS_MM, PRESS_STEPS, SETTLE_STEPS = 8.0, 60, 30
@@ -286,17 +288,19 @@ def _switches(
 ) -> Iterator[dict[str, Any]]:
     """The B-mode image with harmonics, compounding, persistence and Doppler, each with all detail."""
 
-    def b_mode(settings: dict[str, Any], persistence: float = 0.0) -> np.ndarray:
+    persistence = Persistence()
+
+    def b_mode(settings: dict[str, Any]) -> PlaneImages:
         changed, window = probe.model_copy(update=settings), (image.window_hu, image.level_hu)
-        return scanner.images(plane, changed, "b-mode", "elevation", *window, None, persistence)["B-mode"]
+        return scanner.images(plane, changed, "b-mode", "elevation", *window)
 
     def with_doppler(mode: DopplerMode) -> None:
-        scanner.doppler(probe, b_mode({}), mode)
+        scanner.doppler(b_mode({}), mode)
 
     switches: dict[str, Callable[[], Any]] = {
         "harmonics": partial(b_mode, {"harmonics": True}),
         "compounding of 3 angles": partial(b_mode, {"compound_angles": 3}),
-        "persistence": partial(b_mode, {}, 0.5),
+        "persistence": lambda: persistence.mixed(b_mode({}), 0.5),
         "colour Doppler": partial(with_doppler, "colour"),
         "power Doppler": partial(with_doppler, "power"),
     }

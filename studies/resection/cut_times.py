@@ -44,7 +44,8 @@ def cut_times(rehearsal: Rehearsal) -> CutTimes:
     times = CutTimes()
     assert rehearsal.scanner is not None
     # What images need is there before the first cut.
-    _ = rehearsal.scanner.ct, rehearsal.scanner.organ, rehearsal.scanner.tissue
+    volumes = rehearsal.scanner.volumes
+    _ = volumes.ct, volumes.organ, volumes.tissue
     for repeat in range(REPEATS):
         rehearsal.reset()
         marked, cut = _resections(rehearsal, MARGIN_MM + DIFFERENT_MM * repeat)
@@ -80,9 +81,8 @@ def _time_parts(rehearsal: Rehearsal, resection: Resection, times: CutTimes) -> 
     times.measure("- specimen and remnant", lambda: cut_organ(organ, line, settings, points))
     made = cut_organ(organ, line, settings, points)
     times.measure("- tissue and contacts", lambda: PressedOrgan.apply_cut(rehearsal, made))
-    times.measure(
-        "- crater in the image", lambda: scanner.set_crater(Crater(made.specimen, settings.filling))
-    )
+    crater = Crater(made.specimen, settings.filling)
+    times.measure("- crater in the image", lambda: scanner.volumes.set_crater(crater))
     rehearsal.apply_cut(None)
 
 

@@ -60,7 +60,7 @@ class Fake:
         place[0, 3] = self.steps
         return SimpleNamespace(world_from_plane=place)
 
-    def image_view(self, rehearsal, probe, settings, tally, shape=None, time_s=0.0) -> View:
+    def image_view(self, rehearsal, probe, settings, tally, shape=None, time_s=0.0, persistence=None) -> View:
         grey = np.full(shape or (4, 4), self.steps, np.uint8)
         width, depth, _ = probe.extent_mm
         return View(np.eye(4), {"B-mode": grey, "CT": 255 - grey}, width, depth)

@@ -164,9 +164,8 @@ def test_it_opens_in_contact_with_a_picture(device, patient, folder, parts):
     assert "Drop-in" in rehearsal.probe.transducer_name
     rehearsal.advance(rehearsal.scripted_pose(0.0))
     rehearsal.update_surfaces()
-    image = rehearsal.scanner.images(
-        rehearsal.image_plane(), rehearsal.probe, "b-mode", "speckle", 350.0, 40.0
-    )
+    look = rehearsal.image_plane(), rehearsal.probe, "b-mode", "speckle", 350.0, 40.0
+    image = rehearsal.scanner.images(*look).by_name
     measurements = LiveMeasurements(rehearsal)
     measurements.watch(Session(rehearsal), rehearsal.probe)
     assert measurements._touches.mean() > 0.8

@@ -26,7 +26,9 @@ from scenes.volumes.lazy_volume import LazyVolume
 from sim.fields import array_of
 from sim.signed_distance import signed_distance
 from sim.skinning import Skin
+from ultrasound.persistence import Persistence
 from ultrasound.probe_manipulator import image_plane
+from ultrasound.scanner import B_MODE
 
 pytestmark = pytest.mark.usefixtures("arrays_stored")
 
@@ -80,7 +82,7 @@ def assert_at_rest_the_slice_is_the_ct(scene: Scene, folder: Path) -> None:
     rehearsal.pose = rehearsal.manipulator.pose()
     rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK_AT_CT)
     plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
-    cut = rehearsal.scanner
+    cut = rehearsal.scanner.ct_slice
     inside = organ_mask(cut)
     difference = np.abs(hounsfield(cut) - resampled(folder, plane, rehearsal.origin, scene.image.pixels))
     print(f"mean {difference[inside].mean():.4f} HU, maximum {difference[inside].max():.3f} HU")
@@ -99,7 +101,7 @@ def test_at_rest_the_slice_is_a_real_ct_however_its_voxels_lie(one_device, data,
 
 def test_pressing_moves_the_tissue_and_the_slice_follows(kept):
     rehearsal = kept(pressed_phantom)
-    before = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK)
+    before = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK).by_name
     top = array_of(rehearsal.organ_skin.vertices)
     for step in range(31):
         rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
@@ -107,14 +109,14 @@ def test_pressing_moves_the_tissue_and_the_slice_follows(kept):
     moved = array_of(rehearsal.organ_skin.vertices) - top
     assert rehearsal.indentation_mm() == pytest.approx(12.38)
     assert (moved @ rehearsal.gravity_direction).max() > 6.0
-    pressed = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK)
+    pressed = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK).by_name
     assert list(pressed) == ["B-mode", "CT"]
     assert all(np.abs(pressed[name].astype(int) - before[name]).mean() > 10 for name in before)
     assert 0.97 < rehearsal.volume_ratio() < 1.0
     assert rehearsal.contacts.measure_penetration() <= 0.5
     rehearsal.reset()
     rehearsal.update_surfaces()
-    after = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK)
+    after = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK).by_name
     assert all(np.array_equal(after[name], before[name]) for name in before)
     assert rehearsal.indentation_mm() == pytest.approx(0.0, abs=1e-6)
 
@@ -125,7 +127,7 @@ def test_a_pixel_shows_the_tissue_that_is_there_now(kept):
         rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
     rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK_AT_CT)
     plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
-    pixels = np.argwhere(organ_mask(rehearsal.scanner))[::1009]
+    pixels = np.argwhere(organ_mask(rehearsal.scanner.ct_slice))[::1009]
     spacing = np.array([plane.width_mm, plane.depth_mm]) / rehearsal.scene.image.pixels
     local = (pixels[:, ::-1] + 0.5) * spacing - [plane.width_mm / 2, 0]
     shown_at = np.column_stack([local, np.zeros(len(local)), np.ones(len(local))]) @ plane.world_from_plane.T
@@ -209,6 +211,27 @@ def test_an_image_has_the_rows_and_columns_asked_for_and_at_most_the_scenes(kept
     ):
         view = image_view(rehearsal, rehearsal.probe, initial_settings(rehearsal), Tally(0.0), asked)
         assert {image.shape[:2] for image in view.images.values()} == {made}
+
+
+def test_an_image_that_is_saved_leaves_the_persistence_of_those_shown_as_it_is(kept):
+    rehearsal = kept(pressed_phantom)
+    settings = initial_settings(rehearsal)
+    settings.persistence_percent, settings.mode = 60, "b-mode"
+    poses = [rehearsal.pose_at_depth(depth) for depth in (1.0, 2.0, 3.0)]
+
+    def image(pose: np.ndarray, persistence: Persistence | None) -> np.ndarray:
+        rehearsal.pose = pose
+        given = rehearsal.probe, settings, Tally(0.0), None, 0.0, persistence
+        return image_view(rehearsal, *given).images[B_MODE]
+
+    first, second = Persistence(), Persistence()
+    shown = [image(pose, first) for pose in poses]
+    alone = []
+    for pose, expected in zip(poses, shown, strict=True):
+        alone.append(image(pose, None))
+        assert np.array_equal(image(pose, second), expected)
+    assert np.array_equal(alone[0], shown[0])
+    assert all((own != mixed).any() for own, mixed in zip(alone[1:], shown[1:], strict=True))
 
 
 def test_the_outline_is_the_tumours_border_not_what_is_drawn_of_it(kept):

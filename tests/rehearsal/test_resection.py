@@ -118,7 +118,8 @@ def test_a_cut_keeps_the_margin_and_undo_brings_all_back_bit_for_bit(rehearsal, 
     for _ in range(3):
         rehearsal.advance(rehearsal.pose)
     rehearsal.update_surfaces()
-    image = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, "both", "speckle", 350, 40)
+    look = rehearsal.image_plane(), rehearsal.probe, "both", "speckle", 350, 40
+    image = rehearsal.scanner.images(*look).by_name
     before, vertices = rehearsal.digest(), array_of(rehearsal.organ_skin.vertices)
     live = resected(rehearsal, marks)
     cut, judged = rehearsal.cut, rehearsal.judgement
@@ -147,7 +148,7 @@ def test_a_cut_keeps_the_margin_and_undo_brings_all_back_bit_for_bit(rehearsal, 
     assert rehearsal.digest() == before and rehearsal.organ is rehearsal.whole_organ
     rehearsal.update_surfaces()
     assert np.array_equal(array_of(rehearsal.organ_skin.vertices), vertices)
-    again = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, "both", "speckle", 350, 40)
+    again = rehearsal.scanner.images(*look).by_name
     assert all(np.array_equal(image[name], again[name]) for name in image)
     moved(live, redo=True)
     moved(live, redo=True)
@@ -164,7 +165,7 @@ def test_the_images_show_the_crater(rehearsal, marks):
     plane = rehearsal.image_plane()
 
     def ct() -> np.ndarray:
-        return rehearsal.scanner.images(plane, rehearsal.probe, "ct", "speckle", 2000, 0)["CT"]
+        return rehearsal.scanner.images(plane, rehearsal.probe, "ct", "speckle", 2000, 0).by_name["CT"]
 
     before = ct()
     resected(rehearsal, marks, CutSettings("enucleoresection", MARGIN_MM, None, "air"))

@@ -23,7 +23,8 @@ from sim.fields import array_of
 from sim.skinning import Skin
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import ImagePlane, image_plane, pose_at, pose_of_image_plane
-from ultrasound.scanner import B_MODE, CT, ScannedAnatomy, Scanner, plane_section
+from ultrasound.scanned_anatomy import ScannedAnatomy
+from ultrasound.scanner import B_MODE, CT, Scanner, plane_section
 
 STORED = Path(__file__).parent / "pictures"
 PIXELS, WIDTH, DEPTH = 256, 36.0, 30.0
@@ -88,7 +89,7 @@ class Scene:
 
     def images(self, plane: ImagePlane) -> dict[str, np.ndarray]:
         """CT and B-mode as the panel shows them, with the organ's outline, uint8 (rows, columns, 3) each."""
-        shown = self.scanner.images(plane, PROBE, "both", "speckle", 350.0, 40.0)
+        shown = self.scanner.images(plane, PROBE, "both", "speckle", 350.0, 40.0).by_name
         outline = plane_section(
             array_of(self.surface.vertices), self.anatomy.organ.faces, np.linalg.inv(plane.world_from_plane)
         )
@@ -171,7 +172,7 @@ def window(scene):
 
 def drawn(window, scene: Scene, plane: ImagePlane) -> np.ndarray:
     """The 3D view, uint8 (rows, columns, 3), of means over blocks of pixels."""
-    shown = scene.scanner.images(plane, PROBE, "ct", "speckle", 350.0, 40.0)
+    shown = scene.scanner.images(plane, PROBE, "ct", "speckle", 350.0, 40.0).by_name
     window.draw(View(pose_of_image_plane(plane.world_from_plane, 20.0), shown, WIDTH, DEPTH))
     area = window.layout.scene
     rows, columns = area.height // BLOCK, area.width // BLOCK

@@ -42,8 +42,8 @@ def rehearsed(threads: int) -> str:
         rehearsal.advance(rehearsal.scripted_pose(step / 20 * rehearsal.script_length_s()))
     state, wrench = rehearsal.body.snapshot(), rehearsal.wrench()
     pictures = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK)
-    colour = rehearsal.scanner.doppler(rehearsal.probe, pictures["B-mode"], "colour")
-    arrays = state.position, state.velocity, wrench, *pictures.values(), colour
+    colour = rehearsal.scanner.doppler(pictures, "colour")
+    arrays = state.position, state.velocity, wrench, *pictures.by_name.values(), colour
     return hashlib.sha256(b"".join(each.tobytes() for each in arrays)).hexdigest()
 
 

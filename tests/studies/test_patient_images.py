@@ -34,7 +34,7 @@ from studies.patient_images.signal_to_noise import depth_of_noise_mm, snr_db
 from studies.patient_images.standard_planes import standard_planes
 from ultrasound.acoustics import CORTEX_DB, acoustic_table, tissue_table
 from ultrasound.probe import load_probe
-from ultrasound.scanner import ScannedAnatomy
+from ultrasound.scanned_anatomy import ScannedAnatomy
 
 RADIUS = 25.0
 FAT, KIDNEY, BONE, GAS = -100.0, 30.0, 800.0, -1000.0

@@ -1,12 +1,11 @@
 """Blood flow at voxels: along drawn vessels, from and to the kidney by their kind, with a parabolic profile."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from conftest import rotation_about
 
 from ultrasound.acoustics import TissueVoxels
+from ultrasound.anatomy_volumes import flow_volume
 from ultrasound.blood_flow import (
     BEAT_S,
     CHANNELS,
@@ -16,7 +15,6 @@ from ultrasound.blood_flow import (
     pulse_share,
     stored_flow,
 )
-from ultrasound.scanner import Scanner
 
 SPACING, SHAPE, RADIUS = np.array([0.8, 0.8, 0.8]), (90, 40, 40), 3.0
 TISSUES = {1: "kidney", 2: "artery", 3: "vein", 4: "vessel", 5: "necrosis", 6: "tumour"}
@@ -56,11 +54,8 @@ def test_blood_flows_to_the_kidney_in_arteries_and_from_it_in_veins(value, kind,
 
 
 @pytest.mark.parametrize("kind, sign", [("artery", 1), ("vein", -1)])
-def test_the_scanners_flow_is_along_the_vessel_in_thick_oblique_slices(monkeypatch, kind, sign):
+def test_the_volume_of_flow_is_along_the_vessel_in_thick_oblique_slices(device, kind, sign):
     """A straight vessel of 16 mm into a kidney, off the origin; where it flows and whither, in the patient."""
-    monkeypatch.setattr(
-        "ultrasound.scanner.SampledVolume", lambda values, from_mm, outside: (values, from_mm)
-    )
     mm_from_index = np.eye(4)
     mm_from_index[:3, :3] = rotation_about([1, 2, 3], 40) * [0.9, 1.4, 5.0]
     shape, begin, along = (110, 80, 24), np.array([60.0, -40.0, 110.0]), np.array([0.48, 0.64, 0.6])
@@ -73,9 +68,8 @@ def test_the_scanners_flow_is_along_the_vessel_in_thick_oblique_slices(monkeypat
     voxels = TissueVoxels(
         np.zeros(shape, np.int16), labels, {1: "sinus", 2: kind}, np.linalg.inv(mm_from_index)
     )
-    anatomy = SimpleNamespace(voxels=voxels)
-    given = SimpleNamespace(anatomy=anatomy, _with_crater=lambda name, volume: volume)
-    values, from_mm = Scanner.flow.func(given)
+    volume = flow_volume(voxels)
+    values, from_mm = volume.values((slice(None),) * 3), volume.index_from_mm
     flows = np.argwhere(np.linalg.norm(values[..., :3], axis=-1) > 0)
     at = flows @ np.linalg.inv(from_mm)[:3, :3].T + np.linalg.inv(from_mm)[:3, 3] - begin
     assert at.mean(axis=0) == pytest.approx(18 * along, abs=2.5)

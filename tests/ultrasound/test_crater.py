@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import rotation_about
-from test_scanner import PIXELS, PROBE, anatomy
+from test_scanner import anatomy
 
-from sim.embedding import Unmoved
 from ultrasound.acoustics import properties
+from ultrasound.anatomy_volumes import AnatomyVolumes
 from ultrasound.crater import FILLINGS, FINE_MM, Crater
 from ultrasound.sampled_volume import AIR_HU, SampledVolume
-from ultrasound.scanner import Scanner
 
 RADIUS, VOXEL_MM = 9.0, 1.5
 MIDDLE = np.array([4.0, -2.0, 3.0])
@@ -113,49 +112,58 @@ def test_the_box_has_all_voxels_that_it_changes_and_ends_with_the_volume(device)
     assert far.replaced(volume, far.hu())[1].size == 0
 
 
-def scanner_of_a_ball() -> Scanner:
-    """A ball of kidney whose upper part is an artery."""
+NAMES = "ct", "organ", "tissue", "flow", "remnant", "tumour"
+EVERYTHING = (slice(None),) * 3
+# Across the border of the ball's upper part.
+BALL = trimesh.creation.icosphere(subdivisions=3, radius=5.0).apply_translation([0.0, 0.0, 8.0])
+
+
+def volumes_of_a_ball() -> AnatomyVolumes:
+    """A ball of kidney whose upper part is an artery, with a tumour in it."""
     ball = anatomy()
     height = np.indices(ball.labels.shape)[2] - (ball.labels.shape[2] - 1) / 2
     labels = np.where(height > 4, 2 * ball.labels, ball.labels)
-    tissues = {1: "kidney", 2: "artery"}
-    return Scanner(replace(ball, labels=labels, tissues=tissues), Unmoved(), PROBE, PIXELS)
+    tumour = trimesh.creation.icosphere(subdivisions=3, radius=4.0).apply_translation([0.0, 0.0, 6.0])
+    return AnatomyVolumes(replace(ball, labels=labels, tissues={1: "kidney", 2: "artery"}, tumour=tumour))
+
+
+def values_of(volumes: AnatomyVolumes) -> dict[str, np.ndarray]:
+    return {name: getattr(volumes, name).values(EVERYTHING) for name in NAMES}
 
 
 @pytest.mark.parametrize("filling", FILLINGS)
-def test_a_scanner_shows_the_crater_and_restores_all_voxels_to_the_bit(device, filling):
-    scanner, middle = scanner_of_a_ball(), np.array([0.0, 0.0, 8.0])
-    surface = trimesh.creation.icosphere(subdivisions=3, radius=5.0).apply_translation(middle)
-    crater, everything = Crater(surface, filling), (slice(None),) * 3
-
-    def volumes() -> dict[str, np.ndarray]:
-        return {name: getattr(scanner, name).values(everything) for name in ("ct", "organ", "tissue", "flow")}
+def test_all_volumes_have_the_crater_and_are_restored_to_the_bit(device, filling):
+    volumes, crater = volumes_of_a_ball(), Crater(BALL, filling)
 
     def at_middle(name: str) -> np.ndarray:
-        volume = getattr(scanner, name)
-        return volume.values(everything)[
-            tuple(np.rint(volume.index_from_mm @ [*middle, 1.0]).astype(int)[:3])
-        ]
+        volume = getattr(volumes, name)
+        at = volume.index_from_mm @ [0.0, 0.0, 8.0, 1.0]
+        return volume.values(EVERYTHING)[tuple(np.rint(at).astype(int)[:3])]
 
-    before = volumes()
+    before = values_of(volumes)
     assert before["flow"].any()
-    scanner.set_crater(crater)
-    during = volumes()
+    volumes.set_crater(crater)
+    during = values_of(volumes)
     assert at_middle("ct") == crater.hu() and not at_middle("flow").any()
     assert at_middle("tissue") == pytest.approx(crater.acoustics(), abs=1e-6)
     # Fluid carries sound, as the organ does; air does not.
     assert np.array_equal(before["organ"], during["organ"]) == (filling == "fluid")
     assert at_middle("organ") * (1 if filling == "air" else -1) > 0
-    scanner.set_crater(None)
-    for name, values in volumes().items():
+    # Labels show neither as organ or tumour.
+    assert at_middle("remnant") > 0 and at_middle("tumour") > 0
+    volumes.set_crater(None)
+    for name, values in values_of(volumes).items():
         np.testing.assert_array_equal(values, before[name], err_msg=name)
 
 
-def test_a_volume_that_is_built_after_the_cut_has_the_crater_too(device):
-    surface = trimesh.creation.icosphere(subdivisions=3, radius=5.0).apply_translation([0.0, 0.0, 8.0])
-    early, late = scanner_of_a_ball(), scanner_of_a_ball()
-    everything = (slice(None),) * 3
-    _ = early.tissue
-    for scanner in (early, late):
-        scanner.set_crater(Crater(surface, "air"))
-    np.testing.assert_array_equal(late.tissue.values(everything), early.tissue.values(everything))
+def test_volumes_depend_on_the_present_crater_alone(device):
+    """Whatever crater was there before, and whether they were used before or after the cut."""
+    early, late, other = volumes_of_a_ball(), volumes_of_a_ball(), BALL.copy().apply_translation([3.0, 0, 0])
+    _ = values_of(early)
+    for number, crater in enumerate((Crater(other, "air"), Crater(other, "fluid"), Crater(BALL, "air")), 1):
+        early.set_crater(crater)
+        assert early.version == number
+    late.set_crater(crater)
+    first, second = values_of(early), values_of(late)
+    for name in NAMES:
+        np.testing.assert_array_equal(first[name], second[name], err_msg=name)

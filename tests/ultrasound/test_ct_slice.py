@@ -19,11 +19,11 @@ from sim.fields import array_of, fill, fill_evenly
 from sim.kernels import kernel
 from sim.shape_matching import ShapeMatching
 from sim.skinning import Skin
+from ultrasound.ct_slice import CTSlice
 from ultrasound.plane_in_tissue import PlaneInTissue
-from ultrasound.probe import load_probe
 from ultrasound.probe_manipulator import ImagePlane, image_plane, pose_at
-from ultrasound.sampled_volume import distance_volume
-from ultrasound.scanner import ScannedAnatomy, Scanner
+from ultrasound.sampled_volume import SampledVolume, distance_volume
+from ultrasound.scanner import OUTSIDE
 
 RADIUS = 2.0
 GRADIENT = np.array([11.0, -7.0, 5.0])  # HU / mm
@@ -52,13 +52,15 @@ def noisy_image() -> sitk.Image:
     return noisy
 
 
-def anatomy_of(mesh, image: sitk.Image) -> ScannedAnatomy:
+def voxels_of(image: sitk.Image) -> np.ndarray:
+    return sitk.GetArrayFromImage(image).transpose(2, 1, 0)
+
+
+def volume_of(image: sitk.Image) -> SampledVolume:
     mm_from_index = np.eye(4)
     mm_from_index[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
     mm_from_index[:3, 3] = image.GetOrigin()
-    return ScannedAnatomy(
-        mesh, sitk.GetArrayFromImage(image).transpose(2, 1, 0), np.linalg.inv(mm_from_index)
-    )
+    return SampledVolume(voxels_of(image), np.linalg.inv(mm_from_index))
 
 
 def oblique_plane(width: float = 30.0, depth: float = 26.0):
@@ -99,11 +101,10 @@ def embedded(mesh, margin_mm: float = 0.0) -> Embedded:
     return Embedded(model, Embedding(model.carrier, mesh, 2 * RADIUS, margin_mm))
 
 
-def cut_of(embedding: Embedding | Unmoved, mesh, image: Callable, pixels: int, outside: str) -> Scanner:
-    scanner = Scanner(anatomy_of(mesh, image()), embedding, load_probe("drop-in"), pixels, outside)
-    # Finer than usual, so that the border is as exact as these tests ask for.
-    scanner.organ = distance_volume(mesh, 1.0)
-    return scanner
+def cut_of(embedding: Embedding | Unmoved, mesh, image: Callable, pixels: int, outside: str) -> CTSlice:
+    # Distances finer than usual, so that the border is as exact as these tests ask for.
+    volumes = volume_of(image()), distance_volume(mesh, 1.0)
+    return CTSlice(PlaneInTissue(embedding, pixels), *volumes, OUTSIDE[outside][0])
 
 
 def sliced(kept, mesh, image: Callable, move=None, pixels: int = 96, outside: str = "gel"):
@@ -112,10 +113,9 @@ def sliced(kept, mesh, image: Callable, move=None, pixels: int = 96, outside: st
         body.move(move(body.model.body.rest_points))
     # Only the voxels differ from image to image.
     cut = kept(cut_of, body.embedding, mesh, ramp_image, pixels, outside)
-    cut.ct.set_values((slice(None),) * 3, anatomy_of(mesh, image()).hu)
+    cut.ct.set_values((slice(None),) * 3, voxels_of(image()))
     plane = oblique_plane()
     cut.plane.locate(plane)
-    cut.ct_slice(350.0, 40.0)
     return cut, plane, body.model, body.embedding
 
 
@@ -177,7 +177,7 @@ def test_under_an_affine_deformation_it_is_the_pull_back_within_the_skins_error(
 def test_the_picture_is_the_window(kept, ball):
     cut, _, _, _ = sliced(kept, ball, noisy_image)
     wanted = np.clip((hounsfield(cut).astype(float) - 40) / 350 + 0.5, 0, 1) * 255
-    assert np.abs(cut.ct_slice(350.0, 40.0) - wanted).max() <= 0.51
+    assert np.abs(cut.render(350.0, 40.0) - wanted).max() <= 0.51
 
 
 def bent(x: np.ndarray) -> np.ndarray:
@@ -351,7 +351,6 @@ def test_tissue_that_does_not_move_is_shown_in_place(kept, ball):
     cut = cut_of(Unmoved(), ball, noisy_image, 96, "background")
     plane = oblique_plane()
     cut.plane.locate(plane)
-    cut.ct_slice(350.0, 40.0)
     assert np.abs(cut.plane.rest_grid(96) - pixel_points(plane, 96)).max() < 1e-4
     still, _, _, _ = sliced(kept, ball, noisy_image, outside="background")
     assert np.abs(hounsfield(cut) - hounsfield(still)).max() < 0.05

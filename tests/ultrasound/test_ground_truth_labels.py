@@ -15,7 +15,8 @@ from ultrasound.plane_in_tissue import PlaneInTissue
 from ultrasound.probe import load_probe
 from ultrasound.probe_manipulator import ImagePlane, image_plane, pose_at
 from ultrasound.sampled_volume import distance_volume
-from ultrasound.scanner import ScannedAnatomy, Scanner
+from ultrasound.scanned_anatomy import ScannedAnatomy
+from ultrasound.scanner import CT, Scanner
 from ultrasound.sweep import PixelLabel
 
 PIXELS = 120
@@ -170,9 +171,8 @@ def test_the_matrices_beside_a_picture_lead_to_what_it_shows(device):
         for r in (30.0, 12.0)
     )
     scanner = Scanner(ScannedAnatomy(organ, hu, index_from_mm, tumour=mass), Unmoved(), probe, PIXELS)
-    picture = scanner.images(plane_of(rehearsal, probe), probe, "ct", "speckle", 1000.0, -500.0)["CT"].astype(
-        float
-    )
+    images = scanner.images(plane_of(rehearsal, probe), probe, "ct", "speckle", 1000.0, -500.0)
+    picture = images.by_name[CT].astype(float)
     rows, columns = np.indices(picture.shape)
     light = picture**2
     # A spot of 4 mm in voxels of 1.5 mm and pixels of 1.5 x 1.1.

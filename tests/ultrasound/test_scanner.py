@@ -3,6 +3,7 @@
 import gc
 import weakref
 from dataclasses import replace
+from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,10 +15,12 @@ from slicing import hounsfield
 from sim.embedding import Unmoved
 from sim.fields import array_of
 from ultrasound.acoustics import acoustic_values
+from ultrasound.bmode import Wavefront
 from ultrasound.interface import Surface
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import ImagePlane, image_plane, pose_at
-from ultrasound.scanner import CT, ScannedAnatomy, Scanner, start_acoustics
+from ultrasound.scanned_anatomy import ScannedAnatomy, start_acoustics
+from ultrasound.scanner import B_MODE, CT, PlaneImages, Scanner
 
 PIXELS, RADIUS, REACH = 64, 12.0, 20.0
 PROBE = Probe(
@@ -72,8 +75,8 @@ def test_voxels_are_measured_along_their_own_axes(spacing):
 
 
 def test_the_slice_is_windowed_as_asked_for(usual):
-    picture = usual.images(plane_at(), PROBE, "ct", "speckle", 400.0, 20.0)[CT]
-    wanted = np.clip((hounsfield(usual).astype(float) - 20.0) / 400.0 + 0.5, 0, 1) * 255
+    picture = usual.images(plane_at(), PROBE, "ct", "speckle", 400.0, 20.0).by_name[CT]
+    wanted = np.clip((hounsfield(usual.ct_slice).astype(float) - 20.0) / 400.0 + 0.5, 0, 1) * 255
     assert np.ptp(wanted) > 50 and np.abs(picture - wanted).max() <= 0.51
 
 
@@ -86,14 +89,20 @@ def of_60_pixels(one_device) -> Scanner:
 def test_an_image_of_fewer_pixels_shows_the_same_places(of_60_pixels, shape):
     scanner = of_60_pixels
     look = plane_at(), PROBE, "both", "speckle", 400.0, 20.0
-    whole, smaller = scanner.images(*look), scanner.images(*look, shape)
+    whole, smaller = scanner.images(*look).by_name, scanner.images(*look, shape).by_name
     # Of three pixels the middle one has the centre of a pixel three times as large. Maps in float32 differ by rounding, of 30 mm by 2e-6.
     middle = tuple(slice(1, None, 3) if count == 20 else slice(None) for count in shape)
     for name, image in smaller.items():
         assert image.shape == shape and np.ptp(whole[name]) > 50
         assert np.abs(image.astype(int) - whole[name][middle]).max() <= 1
     assert scanner.ground_truth.render().shape == shape
-    assert np.array_equal(scanner.images(*look)["B-mode"], whole["B-mode"])
+    assert np.array_equal(scanner.images(*look).by_name[B_MODE], whole[B_MODE])
+
+
+@pytest.mark.parametrize("shape", [(61, 60), (60, 61)])
+def test_an_image_has_no_more_pixels_than_the_scene(of_60_pixels, shape):
+    with pytest.raises(ValueError, match="at most 60"):
+        of_60_pixels.images(plane_at(), PROBE, "ct", "speckle", 400.0, 20.0, shape)
 
 
 def test_each_image_is_of_the_body_as_it_is_now(usual, monkeypatch):
@@ -126,7 +135,7 @@ def test_sound_enters_through_fluid_and_the_ct_is_shown(usual):
     assert echo(scanner, plane_at(4.4))[:40].max() < -170.0
     for made in (scanner, usual):
         made.locate(plane_at(3.0))
-    assert np.array_equal(scanner.ct_slice(400.0, 20.0), usual.ct_slice(400.0, 20.0))
+    assert np.array_equal(scanner.ct_slice.render(400.0, 20.0), usual.ct_slice.render(400.0, 20.0))
 
 
 def test_beyond_the_ct_is_silence(usual):
@@ -164,9 +173,12 @@ def scattering(one_device) -> Scanner:
     return scattering_of(UPRIGHT)
 
 
-def b_mode(scanner: Scanner, probe: Probe, persistence: float = 0.0, above: float = -10.0) -> np.ndarray:
-    shown = "b-mode", "speckle", 350.0, 40.0, None, persistence
-    return scanner.images(plane_at(above), probe, *shown)["B-mode"].astype(float)
+def images_of(scanner: Scanner, probe: Probe, above: float = -10.0) -> PlaneImages:
+    return scanner.images(plane_at(above), probe, "b-mode", "speckle", 350.0, 40.0)
+
+
+def b_mode(scanner: Scanner, probe: Probe, above: float = -10.0) -> np.ndarray:
+    return images_of(scanner, probe, above).by_name[B_MODE].astype(float)
 
 
 def test_compounding_averages_the_speckle_of_three_angles(scattering):
@@ -184,13 +196,51 @@ def test_compounding_averages_the_speckle_of_three_angles(scattering):
 def test_images_that_were_steered_for_compounding_are_freed_with_it(one_device):
     scanner = scattering_of(UPRIGHT)
     b_mode(scanner, PROBE.model_copy(update={"compound_angles": 5}))
-    steered = [weakref.ref(each) for each in scanner._steered.values()]
+    steered = [weakref.ref(each) for each in scanner.compounding.steered.values()]
     b_mode(scanner, PROBE.model_copy(update={"compound_angles": 3}))
     gc.collect()
     assert len(steered) == 4 and sum(each() is not None for each in steered) <= 2
     b_mode(scanner, PROBE)
     gc.collect()
-    assert not any(each() for each in steered) and not scanner._steered
+    assert not any(each() for each in steered) and not scanner.compounding.steered
+
+
+def test_an_image_is_the_same_whatever_was_imaged_before(scattering):
+    levels, plane, first = ("reflection", "speckle", "elevation"), plane_at(-9.0), {}
+    for _ in range(2):
+        for level, angles in product(levels, (1, 3)):
+            probe = PROBE.model_copy(update={"compound_angles": angles})
+            made = scattering.images(plane, probe, "both", level, 350.0, 40.0)
+            before = first.setdefault((level, angles), made)
+            assert all(np.array_equal(made.by_name[name], before.by_name[name]) for name in (B_MODE, CT))
+        other = {"compound_angles": 5, "frequency_mhz": 5.0, "colour_steering_deg": 10.0}
+        images = images_of(scattering, PROBE.model_copy(update=other), above=-8.0)
+        scattering.doppler(images, "colour", 0.09)
+        scattering.iq(images, None, Wavefront.of(images.probe, images.plane.world_from_plane), 0)
+
+
+def test_doppler_and_signals_of_an_image_are_the_same_again(scattering):
+    probe = PROBE.model_copy(update={"velocity_scale_cm_s": 5.0, "wall_filter_cm_s": 0.5})
+    images = images_of(scattering, probe)
+    reference = Wavefront.of(probe, images.plane.world_from_plane)
+
+    def made() -> list[np.ndarray]:
+        signals = scattering.iq(images, None, reference, 0)
+        return [scattering.doppler(images, "colour", 0.09), signals.iq, signals.rf, signals.rest_mm]
+
+    assert all(np.array_equal(*both) for both in zip(made(), made(), strict=True))
+
+
+@pytest.mark.parametrize("mode", ["b-mode", "ct"])
+def test_doppler_and_signals_of_another_image_than_the_last_are_refused(scattering, mode):
+    images = images_of(scattering, PROBE)
+    last = scattering.images(plane_at(-9.0), PROBE, mode, "speckle", 350.0, 40.0)
+    refused = [images] if mode == "b-mode" else [images, last]
+    for each in refused:
+        with pytest.raises(ValueError, match="made last"):
+            scattering.doppler(each, "colour")
+        with pytest.raises(ValueError, match="made last"):
+            scattering.iq(each, None, Wavefront.of(PROBE, each.plane.world_from_plane), 0)
 
 
 def test_images_of_different_steering_have_independent_speckle(scattering):
@@ -206,25 +256,14 @@ def test_images_of_different_steering_have_independent_speckle(scattering):
     assert abs(np.corrcoef(*apart)[0, 1]) < 0.3
 
 
-def test_persistence_mixes_the_image_before_and_none_is_bit_for_bit_the_image(scattering):
-    first, second = b_mode(scattering, PROBE), b_mode(scattering, PROBE, above=-9.0)
-    assert (first != second).any()
-    b_mode(scattering, PROBE, 0.6)
-    mixed = b_mode(scattering, PROBE, 0.6, above=-9.0)
-    assert np.abs(mixed - (0.6 * first + 0.4 * second)).max() <= 1.0
-    for _ in range(30):
-        mixed = b_mode(scattering, PROBE, 0.6, above=-9.0)
-    assert np.abs(mixed - second).max() <= 1.0
-    assert (b_mode(scattering, PROBE, above=-9.0) == second).all()
-
-
 @pytest.mark.parametrize("turn", ["upright", "turned"])
 def test_doppler_of_a_scene_is_shown_over_its_image_and_not_while_clamped(scattering, turn):
     if turn == "turned":
         scattering = scattering_of(TURNED)
-    grey = b_mode(scattering, PROBE).astype(np.uint8)
     slow = PROBE.model_copy(update={"velocity_scale_cm_s": 5.0, "wall_filter_cm_s": 0.5})
-    flowing, clamped = (scattering.doppler(slow, grey, "colour", 0.09, each) for each in (False, True))
+    images = images_of(scattering, slow)
+    grey = images.by_name[B_MODE]
+    flowing, clamped = (scattering.doppler(images, "colour", 0.09, each) for each in (False, True))
     coloured = (flowing != grey[..., None]).any(axis=-1)
     assert 0.01 < coloured.mean() < 0.5 and (clamped == grey[..., None]).all(axis=-1).mean() > 0.99
     # Small vessels run outward: below the middle of the ball, away from a probe in it.
