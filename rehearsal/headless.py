@@ -106,7 +106,9 @@ class HeadlessLoop:
                 self.rehearsal.stepper.submit(command)
             frame = self.rehearsal.do()
             probe = probe_with_settings(anatomy.case.probe, self.settings)
-            view = self._view(probe) if draws else anatomy.find_plane(probe)
+            view = self._view(probe) if draws else None
+            if not draws:
+                anatomy.find_plane(probe)
             self.tally.add(self.rehearsal, frame)
             for observer in self.observers:
                 observer.observe(frame, probe)
@@ -118,7 +120,9 @@ class HeadlessLoop:
 
     def _view(self, probe: Probe) -> View:
         """The images of the present frame, with the score and the coming cut."""
-        view = image_view(self.rehearsal.anatomy, probe, self.settings, self.tally.slice_ms, None, self._persistence)
+        view = image_view(
+            self.rehearsal.anatomy, probe, self.settings, self.tally.slice_ms, None, self._persistence
+        )
         view = replace(view, warnings=tuple(f"Import: {text}" for text in self.warnings))
         planned = cut_settings(self.settings)
         self.resection.update(planned, lambda points: self.measurements.coverage.is_seen(points))

@@ -7,8 +7,8 @@ from time import perf_counter
 
 import numpy as np
 
+from rehearsal.deformed_anatomy import scanned_anatomy
 from rehearsal.image_and_surface_files import save_images
-from rehearsal.rehearsal import scanned_anatomy
 from scenes.anatomy import Grid, LoadedAnatomy
 from scenes.atomic_files import atomic_write
 from scenes.scene import Image

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import trimesh
@@ -232,10 +232,11 @@ class PressedOrgan:
         if cut is self.cut:
             return
         self.check_can_be_cut()
+        model: Any = self.model
         parts = [part.surface for part in self.parts_of_tissue]
         tissue = None if cut is None else RemovedTissue(cut.specimen, cut.remnant, cut.on_remnant)
-        self.model.remove_tissue(self.case.organ, tissue, parts)
-        lattice = self.model.lattice
+        model.remove_tissue(self.case.organ, tissue, parts)
+        lattice = model.lattice
         self.divergence_check.test_among(lattice.node_mass(np.ones(len(lattice.cells))) > 0)
         self.cut = cut
 

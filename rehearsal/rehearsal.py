@@ -7,9 +7,9 @@ import numpy as np
 
 from rehearsal.case import Case
 from rehearsal.deformed_anatomy import DeformedAnatomy, scanned_ct
-from rehearsal.loop.command import Command, NewSession
+from rehearsal.loop.command import Command, Load, NewSession
 from rehearsal.loop.frame import Frame
-from rehearsal.loop.stepper import LocalStepper
+from rehearsal.loop.stepper import LocalStepper, Stepper
 from rehearsal.loop.timeline import Timeline
 from rehearsal.pressed_organ import PressedOrgan
 from scenes.anatomy import LoadedAnatomy
@@ -42,6 +42,7 @@ class Rehearsal:
         self.organ.settle()
         self.stepper = LocalStepper(Timeline(self.organ))
         self.manipulator = begin(case, self.anatomy, self.stepper)
+        self._settled = self.stepper.timeline.whole_state()
 
     @property
     def frame(self) -> Frame:
@@ -66,8 +67,7 @@ class Rehearsal:
 
     def reset(self) -> None:
         """Begin a session at the start: tissue settled, transducer just touching."""
-        self.stepper.timeline.restart()
-        self.show()
+        self.do(Load(state=self._settled))
 
     def pose_at_depth(self, depth_mm: float) -> np.ndarray:
         """The transducer's pose (4, 4) at a depth of the scripted press."""
@@ -82,11 +82,12 @@ class Rehearsal:
         return self.manipulator.indentation_mm(self.organ.pose)
 
 
-def begin(case: Case, anatomy: DeformedAnatomy, stepper: "LocalStepper") -> ProbeManipulator:
+def begin(case: Case, anatomy: DeformedAnatomy, stepper: Stepper) -> ProbeManipulator:
     """Begin a session with the tissue as it has settled and the transducer just touching; return what moves the transducer."""
     anatomy.show(stepper.newest())
     manipulator = case.manipulator(anatomy.vertices)
     stepper.submit(NewSession(pose=manipulator.pose()))
+    stepper.wait()
     anatomy.show(stepper.newest())
     return manipulator
 

@@ -145,7 +145,8 @@ class RehearsalRun:
         rehearsal, log = self.built.rehearsal, self.files.log
         if rehearsal is None:
             raise ValueError("expected the solver in this process")
-        settings, source = initial_settings(self.anatomy.case), None
+        settings = initial_settings(self.anatomy.case)
+        source: Source
         check = None if log is None else ReplayCheck(log, self.notices)
         if log is not None:
             replay = Replay(log, one_by_one=True)

@@ -153,6 +153,7 @@ def _compression_correction(
 ) -> Places:
     scene, anatomy = patient
     start_taichi(arch)
+    from rehearsal.case import case_of
     from rehearsal.reconstruction.compression_correction import CompressionCorrection
     from rehearsal.rehearsal import Rehearsal
 
@@ -164,7 +165,7 @@ def _compression_correction(
             f"--undo-compression: the sweep was made with the probe {sweep_probe}, the scene has {probe.transducer_name}: "
             "set transducer.probe in the scene"
         )
-    rehearsal = Rehearsal(scene, anatomy, probe)
+    rehearsal = Rehearsal(case_of(scene, anatomy, probe), anatomy)
     return CompressionCorrection(rehearsal, images, image_poses, reference)
 
 

@@ -6,7 +6,7 @@
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, TypeAdapter
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, InstanceOf, PlainSerializer
 
 from rehearsal.loop.history import History
 from rehearsal.loop.state import WholeState
@@ -46,7 +46,7 @@ def are_rigid(poses: np.ndarray) -> bool:
 Pose = Annotated[
     Any, BeforeValidator(rigid_pose), PlainSerializer(lambda pose: np.asarray(pose)[:3].ravel().tolist())
 ]
-Place = Annotated[tuple[float, float, float], Field(strict=False)]
+Place = tuple[float, float, float]
 Seconds = Annotated[float, Field(ge=LEAST_STEP_S, le=MOST_STEP_S)]
 
 
@@ -72,7 +72,7 @@ class Follow(_Command):
     pose: Pose
     input_s: float = 0.0
     took_s: float = Field(0.0, ge=0)
-    manipulator: ManipulatorState | None = None
+    manipulator: InstanceOf[ManipulatorState] | None = None
 
 
 class Pause(_Command):
@@ -92,7 +92,7 @@ class BeginAction(_Command):
     """An action of the user begins: undo restores the present state, with the manipulator's state before it."""
 
     kind: Literal["begin"] = "begin"
-    manipulator: ManipulatorState | None = Field(None, exclude=True)
+    manipulator: InstanceOf[ManipulatorState] | None = Field(None, exclude=True)
 
 
 class Mark(_Command):
@@ -163,17 +163,14 @@ class NewSession(_Command):
 class Load(_Command):
     """Continue from a recorded state: that of a number, at a time [s] of its session; ``kept`` are states that may be restored from there."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
-
     kind: Literal["load"] = "load"
-    state: WholeState
+    state: InstanceOf[WholeState]
     number: int = 0
     time_s: float = 0.0
-    history: History = History()
-    kept: dict[int, WholeState] = {}
+    history: InstanceOf[History] = History()
+    kept: dict[int, InstanceOf[WholeState]] = {}
 
 
 # What a session's file has a line for; moves are packed in lines of their own.
 Recorded = SetValues | BeginAction | Mark | CutOut | Undo | Redo | Reset | Bookmark | GoTo
 Command = Recorded | Move | Follow | Pause | Checkpoint | NewSession | Load
-RECORDED: TypeAdapter[Recorded] = TypeAdapter(Annotated[Recorded, Field(discriminator="kind")])

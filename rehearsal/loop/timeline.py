@@ -5,6 +5,7 @@ It is deterministic: the same commands give the same states, events and bits, wh
 
 import base64
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -184,7 +185,7 @@ class Timeline:
                 return self._restore(self.history.begun(self.number), number, "There is no such bookmark")
         return None
 
-    def _set(self, values: dict[str, bool | int | float | str | None]) -> None:
+    def _set(self, values: dict[str, Any]) -> None:
         """Set what steps depend on; other settings are only recorded."""
         step = self.organ.settings
         for name in ("iterations", "substeps", "stiffness"):

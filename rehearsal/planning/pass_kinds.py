@@ -127,7 +127,7 @@ class PassKind:
 
 def kinds_of(trial: Trial) -> list[PassKind]:
     """Kinds of pass that may show the target: sliding from above, sliding and tilting from the side nearest to it."""
-    above = -np.array(trial.rehearsal.press.direction)
+    above = -np.array(trial.case.press.direction)
     outwards = {"from above": above}
     nearest = nearest_side(trial)
     if nearest is not None and nearest @ above < np.cos(np.radians(APART_DEG)):
@@ -144,19 +144,19 @@ def target_from(trial: Trial, outward: np.ndarray) -> tuple[np.ndarray, np.ndarr
     The frame (4, 4) at its centre, half of its extent (2,) across and along the passes, the width of the image at the centre with the
     probe on the surface above it, and how many passes cover the extent.
     """
-    frame = frame_towards(trial.places.mean(axis=0), outward, np.array(trial.rehearsal.press.lateral))
+    frame = frame_towards(trial.places.mean(axis=0), outward, np.array(trial.case.press.lateral))
     half = np.abs((trial.places - frame[:3, 3]) @ frame[:3, :2]).max(axis=0)
     outward, centre = frame[:3, 2], frame[:3, 3]
-    top = trial.rehearsal.manipulator.ray_hit(centre + FAR_MM * outward, -outward)
+    top = trial.manipulator.ray_hit(centre + FAR_MM * outward, -outward)
     depth = 0.0 if top is None else max(float((top - centre) @ outward), 0.0)
-    probe = trial.rehearsal.probe
+    probe = trial.case.probe
     width = float(probe.number_of_scanlines * probe.line_spacing_mm(np.array([depth]))[0])
     return frame, half, width, int(np.clip(np.ceil(2 * half[0] / width), 1, MOST_PASSES))
 
 
 def nearest_side(trial: Trial) -> np.ndarray | None:
     """The direction (3,) from the target to the nearest surface where a probe can be placed; None where there is none."""
-    manipulator, press, centre = trial.rehearsal.manipulator, trial.rehearsal.press, trial.places.mean(axis=0)
+    manipulator, press, centre = trial.manipulator, trial.case.press, trial.places.mean(axis=0)
     least, found = np.inf, None
     for outward in directions(DIRECTIONS):
         place = manipulator.ray_hit(centre + FAR_MM * outward, -outward)

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from rehearsal.coordinates import probe_in_patient
 from rehearsal.planning.pass_kinds import PassKind, kinds_of
 from rehearsal.planning.pass_selection import best_selection, score_of
 from rehearsal.planning.plan_file import MOST_SWEEPS, Plan, PlanError, PlannedSweep
@@ -85,9 +84,9 @@ class PassSearch:
 
 def search_space(trial: Trial) -> tuple[list[PassKind], dict[str, float | int | str]]:
     """The kinds of pass, and what the tissue is computed with."""
-    rehearsal, step = trial.rehearsal, trial.rehearsal.settings
+    scene, step = trial.case.scene, trial.rehearsal.organ.settings
     solver = dict(time_step_s=step.time_step_s, substeps=step.substeps, iterations=step.iterations)
-    model = rehearsal.scene.tissue.model_dump(mode="json") | solver | rehearsal.model.counts()
+    model = scene.tissue.model_dump(mode="json") | solver | trial.rehearsal.organ.model.counts()
     return kinds_of(trial), model
 
 
@@ -102,7 +101,7 @@ def surrogate_search(trial: Trial, kind: PassKind) -> list[TriedPass]:
 
 def try_pass(trial: Trial, kind: PassKind, parameters: np.ndarray) -> TriedPass | None:
     """Try one pass; None where the instrument cannot hold it."""
-    poses = kind.poses(trial.rehearsal.manipulator, kind.values(parameters))
+    poses = kind.poses(trial.manipulator, kind.values(parameters))
     return None if poses is None or not trial.held([poses]).all() else trial.try_pass(parameters, poses)
 
 
@@ -120,12 +119,12 @@ def try_path(trial: Trial, make: Callable[[Trial], list[np.ndarray]], speed_mm_s
 
 def _placed(trial: Trial, ways: list[np.ndarray]) -> list[np.ndarray]:
     """Poses as those of the probe in the patient."""
-    return [np.stack([probe_in_patient(trial.rehearsal, pose) for pose in each]) for each in ways]
+    return [np.stack([trial.case.probe_in_patient(pose) for pose in poses]) for poses in ways]
 
 
 def _in_order(trial: Trial, kind: PassKind, parameters: list[np.ndarray]) -> list[np.ndarray]:
     """The passes, each the one that begins nearest to the end of the one before."""
-    manipulator = trial.rehearsal.manipulator
+    manipulator = trial.manipulator
     poses = [kind.poses(manipulator, kind.values(each)) for each in parameters]
     left = [each for each in poses if each is not None]
     ordered = [left.pop(0)]

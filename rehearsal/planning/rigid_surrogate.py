@@ -10,7 +10,6 @@ from rehearsal.planning.sweep_score import TriedPass
 from rehearsal.planning.sweep_trial import Trial
 from sim.fields import array_of
 from sim.signed_distance import distance_grid
-from sim.skinning import Skin
 from ultrasound.coverage import REACH_MM, VOXEL_MM
 from ultrasound.probe_manipulator import image_plane
 
@@ -24,15 +23,14 @@ class RigidSurrogate:
     def __init__(self, trial: Trial) -> None:
         self.trial = trial
         trial.rehearsal.reset()
-        self.manipulator = copy.copy(trial.rehearsal.manipulator)
+        self.manipulator = copy.copy(trial.manipulator)
         self.manipulator.samples = self.manipulator.vertices
-        settled = Skin(trial.rehearsal.model, trial.sampled_places)
-        settled.update()
+        settled = trial.rehearsal.anatomy.skin(trial.sampled_places)
         self._places = array_of(settled.vertices).astype(float)
         self._distance, self._low_mm = distance_grid(
             self.manipulator.vertices, self.manipulator.faces, VOXEL_MM, REACH_MM
         )
-        elements = trial.rehearsal.probe.elements()
+        elements = trial.case.probe.elements()
         self._elements = elements[np.linspace(0, len(elements) - 1, ELEMENTS).astype(int)]
 
     def try_pass(self, kind: PassKind, parameters: np.ndarray) -> TriedPass | None:
@@ -40,10 +38,10 @@ class RigidSurrogate:
         poses = kind.poses(self.manipulator, kind.values(parameters))
         if poses is None or not self.trial.held([poses]).all():
             return None
-        rehearsal = self.trial.rehearsal
-        planes = image_plane(poses, rehearsal.size_mm[2], 1.0, 1.0).world_from_plane
+        case = self.trial.case
+        planes = image_plane(poses, case.size_mm[2], 1.0, 1.0).world_from_plane
         outside = self._outside_mm(planes)
-        touches = outside <= rehearsal.scene.image.coupling_gap_mm
+        touches = outside <= case.scene.image.coupling_gap_mm
         depths = np.maximum(-outside.min(axis=1), 0.0)
         return self.trial.tried(
             parameters, poses, self._covered(planes, touches), depths, touches.mean(axis=1)
@@ -57,7 +55,7 @@ class RigidSurrogate:
 
     def _covered(self, planes: np.ndarray, touches: np.ndarray) -> np.ndarray:
         """Which places of the target (p,) are on scanlines in contact, on any of the planes (n, 4, 4)."""
-        probe, axes, origins = self.trial.rehearsal.probe, planes[:, :3, :3], planes[:, :3, 3]
+        probe, axes, origins = self.trial.case.probe, planes[:, :3, :3], planes[:, :3, 3]
         aside = self._places @ axes[:, :, 2].T - np.einsum("ni,ni->n", origins, axes[:, :, 2])
         place, n = np.nonzero(np.abs(aside) <= (probe.elevation_width_mm + VOXEL_MM) / 2)
         x, y = np.einsum("ki,kij->jk", self._places[place] - origins[n], axes[n, :, :2])

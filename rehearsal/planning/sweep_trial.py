@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from rehearsal.case import case_of
 from rehearsal.planning.instrument_reach import clear_of_organ, reachable
 from rehearsal.planning.plan_file import DEG_PER_MM, LIFT_MM, LIFTED_MM_S, PlanError
 from rehearsal.planning.sweep_path import LIFTS_MM, transfer
@@ -14,12 +15,11 @@ from rehearsal.planning.sweep_score import MEANS, ScoreTerms, TriedPass, face_ce
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import Scene, Trocar
-from sim.fields import array_of
 from ultrasound.array_contact import measure_contact
 from ultrasound.coverage import GRID_POINTS, VOXEL_MM, Coverage
 from ultrasound.plane_in_tissue import PlaneInTissue
 from ultrasound.probe import Probe
-from ultrasound.probe_manipulator import advanced, poses_between
+from ultrasound.probe_manipulator import ProbeManipulator, advanced, poses_between
 from ultrasound.target import Target
 
 # The most places of the target that are looked at in a search.
@@ -70,9 +70,11 @@ class Trial:
     """
 
     def __init__(self, problem: PlanningProblem) -> None:
-        self.rehearsal = Rehearsal(problem.scene, problem.anatomy, problem.probe)
+        self.case = case_of(problem.scene, problem.anatomy, problem.probe)
+        self.rehearsal = Rehearsal(self.case, problem.anatomy)
+        self.manipulator = self.rehearsal.manipulator
         self.target = problem.target
-        self.coverage = Coverage(self.rehearsal.whole_organ, self.rehearsal.whole_tumour, problem.margin_mm)
+        self.coverage = Coverage(self.case.organ, self.case.tumour, problem.margin_mm)
         self.places = self.coverage.voxel_centres(self.target)
         if len(self.places) == 0:
             raise PlanError(
@@ -80,9 +82,9 @@ class Trial:
             )
         self._sampled = slice(None, None, -(-len(self.places) // PLACES))
         self.sampled_places = self.places[self._sampled]
-        held, origin = self.rehearsal.manipulator, self.rehearsal.origin
-        self.reach = partial(reachable, problem.trocar, held, origin, self.places.mean(axis=0))
-        self.plane = PlaneInTissue(self.rehearsal.embedding, GRID_POINTS)
+        held = self.manipulator, self.case.origin, self.places.mean(axis=0)
+        self.reach = partial(reachable, problem.trocar, *held)
+        self.plane = PlaneInTissue(self.rehearsal.anatomy.embedding, GRID_POINTS)
 
     def run(self, passes: list[np.ndarray], speed_mm_s: float) -> ScoreTerms:
         """Follow a path at a speed on its passes; deterministic."""
@@ -97,7 +99,7 @@ class Trial:
             np.array(self._restored),
             seen=self.coverage.fraction(self.target),
             path_mm=self._path_mm,
-            time_s=self._steps_taken * self.rehearsal.settings.time_step_s,
+            time_s=self._steps_taken * self.rehearsal.organ.settings.time_step_s,
         )
 
     def terms(
@@ -112,13 +114,13 @@ class Trial:
         if not passes:
             return ScoreTerms()
         compression, poses = np.array(compression_mm), np.concatenate(passes)
-        limit = self.rehearsal.scene.transducer.compression_warning_mm
+        limit = self.case.scene.transducer.compression_warning_mm
         return ScoreTerms(
             compression_mean_mm=float(compression.mean()),
             compression_max_mm=float(compression.max()),
             over_limit=float(((compression > limit) | restored).mean()),
             contact=float(np.mean(contact)),
-            incidence_deg=incidence_deg(self.rehearsal.manipulator, poses),
+            incidence_deg=incidence_deg(self.manipulator, poses),
             reachable=float(self.held(passes).mean()),
             **others,
         )
@@ -126,8 +128,8 @@ class Trial:
     def try_pass(self, parameters: np.ndarray, poses: np.ndarray) -> TriedPass:
         """Follow one pass (n, 4, 4) from close above its first pose; deterministic."""
         self._begin(TRIAL_MM_S)
-        self.rehearsal.pose = advanced(poses[0], -ABOVE_MM)
-        self._move(self.rehearsal.pose, poses[0])
+        self.rehearsal.organ.pose = advanced(poses[0], -ABOVE_MM)
+        self._move(self.rehearsal.organ.pose, poses[0])
         self._follow(poses)
         seen = self.coverage.seen[self.coverage.targets[self.target]][self._sampled]
         return self.tried(
@@ -146,17 +148,17 @@ class Trial:
         """A pass with what it has ``seen`` (p,), and the compression and contact at each of its poses."""
         terms = self.terms([poses], compression_mm, contact, restored)
         sums = len(poses) * np.array([getattr(terms, name) for name in MEANS])
-        return TriedPass(parameters, seen, sums, len(poses), path_mm(self.rehearsal.manipulator, poses))
+        return TriedPass(parameters, seen, sums, len(poses), path_mm(self.manipulator, poses))
 
     def transfers(self, passes: list[np.ndarray]) -> list[np.ndarray]:
         """The poses (n, 4, 4) from each pass to the next."""
-        return [transfer(self.rehearsal.manipulator, one[-1], other[0]) for one, other in pairwise(passes)]
+        return [transfer(self.manipulator, one[-1], other[0]) for one, other in pairwise(passes)]
 
     def held(self, passes: list[np.ndarray]) -> np.ndarray:
         """Whether the instrument can hold each pose; and whether the probe can be lifted off the organ from both ends of each pass."""
         # In a hollow of the organ it would meet another part of it.
         lifted = [advanced(pose, -lift) for each in passes for pose in each[[0, -1]] for lift in LIFTS_MM]
-        clear = clear_of_organ(self.rehearsal.manipulator, np.array(lifted))
+        clear = clear_of_organ(self.manipulator, np.array(lifted))
         return np.concatenate([self.reach(np.concatenate(passes)), clear])
 
     def _begin(self, speed_mm_s: float) -> None:
@@ -178,43 +180,43 @@ class Trial:
     def _approach(self, pose: np.ndarray, way: np.ndarray | None) -> None:
         """Lower the probe to a pose, after its way from another pass, if there was one."""
         if way is None:
-            self.rehearsal.pose = advanced(pose, -LIFT_MM)
+            self.rehearsal.organ.pose = advanced(pose, -LIFT_MM)
         else:
             for goal in way:
-                self._move(self.rehearsal.pose, goal, LIFTED_MM_S)
-        self._move(self.rehearsal.pose, pose)
+                self._move(self.rehearsal.organ.pose, goal, LIFTED_MM_S)
+        self._move(self.rehearsal.organ.pose, pose)
 
     def _move(self, start: np.ndarray, end: np.ndarray, speed_mm_s: float | None = None) -> None:
         for pose in poses_between(start, end, self._steps(start, end, speed_mm_s or self._speed_mm_s))[1:]:
             self._step(pose)
 
     def _step(self, pose: np.ndarray) -> None:
-        self._path_mm += self._distance_mm(self.rehearsal.pose, pose)
+        self._path_mm += self._distance_mm(self.rehearsal.organ.pose, pose)
         self.rehearsal.advance(pose)
-        self._was_restored |= bool(self.rehearsal.notice)
+        self._was_restored |= bool(self.rehearsal.organ.notice)
         self._steps_taken += 1
 
     def _distance_mm(self, start: np.ndarray, end: np.ndarray) -> float:
-        start_face, end_face = face_centres(self.rehearsal.manipulator, np.stack([start, end]))
+        start_face, end_face = face_centres(self.manipulator, np.stack([start, end]))
         return float(np.linalg.norm(end_face - start_face))
 
     def _steps(self, start: np.ndarray, end: np.ndarray, speed_mm_s: float) -> int:
         cosine = (np.einsum("ij,ij->", start[:3, :3], end[:3, :3]) - 1) / 2
         angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
         path_mm = max(self._distance_mm(start, end), angle / DEG_PER_MM)
-        steps = path_mm / (speed_mm_s * self.rehearsal.settings.time_step_s)
+        steps = path_mm / (speed_mm_s * self.rehearsal.organ.settings.time_step_s)
         return max(1, int(np.ceil(steps - ROUNDED_STEPS)))
 
     def _measure(self) -> None:
-        rehearsal, organ, probe = self.rehearsal, self.rehearsal.organ, self.rehearsal.probe
-        rehearsal.embedding.update()
-        self.plane.locate(rehearsal.image_plane())
-        gap = rehearsal.scene.image.coupling_gap_mm
+        self.rehearsal.show()
+        anatomy, organ, probe = self.rehearsal.anatomy, self.case.organ, self.case.probe
+        anatomy.embedding.update()
+        self.plane.locate(anatomy.image_plane())
+        gap = self.case.scene.image.coupling_gap_mm
         touches = self.coverage.add(self.plane.rest_grid(GRID_POINTS), probe, gap)
-        rehearsal.organ_skin.update()
-        now = array_of(rehearsal.organ_skin.vertices).astype(float)
+        size_mm, now = self.case.size_mm, anatomy.vertices
         pressed = measure_contact(
-            rehearsal.pose, rehearsal.size_mm, probe.radius_mm, now, np.asarray(organ.vertices), organ.faces
+            anatomy.pose, size_mm, probe.radius_mm, now, np.asarray(organ.vertices), organ.faces
         )
         self._compressions.append(pressed.compression_mm)
         self._contacts.append(float(touches.mean()))

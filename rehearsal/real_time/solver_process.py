@@ -97,8 +97,8 @@ class SolverProcess:
         while (arrays := self._memory.read(self._write)) is None:
             self._receive_frame()
         events, self._events = tuple(self._events), []
-        positions, frames = (*arrays, None)[:2]
-        return Frame(**self._values, positions=positions, frames=frames, events=events)
+        frames = arrays[1] if len(arrays) > 1 else None
+        return Frame(**self._values, positions=arrays[0], frames=frames, events=events)
 
     def _receive_frame(self) -> None:
         sent: Sent = self._receive()

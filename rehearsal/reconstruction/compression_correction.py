@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from rehearsal.coordinates import transducer_at
 from rehearsal.reconstruction.sweep_volumes import ImagePoses
 from rehearsal.rehearsal import Rehearsal
 from ultrasound.plane_in_tissue import PlaneInTissue
@@ -26,7 +25,7 @@ class CompressionCorrection:
         if rows != columns:
             raise SweepError(f"images of {rows} x {columns} pixels: expected a sweep that Nephron recorded")
         self.rehearsal, self.times_s = rehearsal, sweep.times_s
-        self.plane = PlaneInTissue(rehearsal.embedding, rows)
+        self.plane = PlaneInTissue(rehearsal.anatomy.embedding, rows)
         self._poses, self._image_to_probe = {}, {}
         for frame in map(int, image_poses.frames):
             probe = sweep.transform("Probe", reference, frame)
@@ -39,7 +38,7 @@ class CompressionCorrection:
                     f"frame {frame}: ImageToProbe rotates the image: expected a sweep that Nephron recorded"
                 )
             self._image_to_probe[frame] = image_to_probe
-            self._poses[frame] = transducer_at(rehearsal, probe)
+            self._poses[frame] = rehearsal.case.transducer_at(probe)
         self._frame = int(image_poses.frames[0])
         approach(rehearsal, self._poses[self._frame])
 
@@ -48,27 +47,28 @@ class CompressionCorrection:
             elapsed = float(self.times_s[frame] - self.times_s[self._frame])
             move_to(self.rehearsal, self._poses[frame], min(elapsed, LONGEST_S))
             self._frame = frame
-        self.rehearsal.embedding.update()
+        self.rehearsal.show()
+        self.rehearsal.anatomy.embedding.update()
         self.plane.locate(self._plane_of(frame))
-        return self.plane.rest_grid(self.plane.pixels) + self.rehearsal.origin
+        return self.plane.rest_grid(self.plane.pixels) + self.rehearsal.case.origin
 
     def _plane_of(self, frame: int) -> ImagePlane:
         image_to_probe = self._image_to_probe[frame]
         column_mm, row_mm = image_to_probe[0, 0], image_to_probe[1, 1]
-        pose, length = self._poses[frame], self.rehearsal.size_mm[2]
+        pose, length = self._poses[frame], self.rehearsal.case.size_mm[2]
         extent = self.plane.pixels * column_mm, self.plane.pixels * row_mm, row_mm / 2 - image_to_probe[1, 3]
         return image_plane(pose, length, *extent)
 
 
 def approach(rehearsal: Rehearsal, pose: np.ndarray) -> None:
     """Bring the transducer to a pose from above, and wait until the tissue is at rest."""
-    rehearsal.pose = advanced(pose, -APPROACH_MM)
+    rehearsal.organ.pose = advanced(pose, -APPROACH_MM)
     move_to(rehearsal, pose, APPROACH_S)
     move_to(rehearsal, pose, SETTLE_S)
 
 
 def move_to(rehearsal: Rehearsal, pose: np.ndarray, seconds: float) -> None:
     """Move the transducer to a pose at a constant speed."""
-    steps = max(1, round(seconds / rehearsal.settings.time_step_s))
-    for step in poses_between(rehearsal.pose, pose, steps)[1:]:
+    steps = max(1, round(seconds / rehearsal.organ.settings.time_step_s))
+    for step in poses_between(rehearsal.organ.pose, pose, steps)[1:]:
         rehearsal.advance(step)

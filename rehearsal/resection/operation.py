@@ -27,7 +27,7 @@ def cut_command(anatomy: DeformedAnatomy, settings: CutSettings, is_seen: IsSeen
     tumour = anatomy.case.tumour
     points = np.zeros((0, 3)) if tumour is None else np.asarray(tumour.vertices)
     seen = np.ones(len(points), bool) if is_seen is None else is_seen(points)
-    return CutOut(**asdict(settings), seen=base64.b64encode(np.packbits(seen)).decode("ascii"))
+    return CutOut(**asdict(settings), seen=base64.b64encode(np.packbits(seen).tobytes()).decode("ascii"))
 
 
 def seen_share(anatomy: DeformedAnatomy) -> float:

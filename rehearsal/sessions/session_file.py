@@ -86,7 +86,7 @@ class CommandLine(_Line):
     """A command that was applied to the state of a number."""
 
     at: int = Field(ge=0)
-    command: Annotated[Recorded, Field(discriminator="kind", strict=False)]
+    command: Annotated[Recorded, Field(discriminator="kind")]
 
 
 class MovesLine(_Line):
@@ -291,8 +291,8 @@ def _check_history(name: str, log: Log) -> None:
             raise SessionError(f"{name}: it goes to a bookmark that was not set: its file is damaged")
     history = History()
     for number, command in log.commands:
-        history, to = history_after(history, number, command)
-        if isinstance(command, Undo | Redo) and to is None:
+        history, restored = history_after(history, number, command)
+        if isinstance(command, Undo | Redo) and restored is None:
             raise SessionError(f"{name}: it restores a state that had not been made: its file is damaged")
 
 

@@ -133,7 +133,7 @@ class UserSource:
             self.tracker.wait()
 
     def _changed_settings(self, controls: Controls) -> Iterator[Command]:
-        values = {name: value for name, value in asdict(controls.settings).items()}
+        values = asdict(controls.settings)
         changed = {name: value for name, value in values.items() if self._set.get(name) != value}
         if changed:
             self._set = values
