@@ -181,7 +181,9 @@ def often(monkeypatch) -> None:
     monkeypatch.setattr(timeline_module, "CHECKPOINT_S", CHECKPOINT_S)
 
 
-AnySession.TestCase.settings = settings(max_examples=80, stateful_step_count=30, deadline=None, derandomize=True)
+AnySession.TestCase.settings = settings(
+    max_examples=80, stateful_step_count=30, deadline=None, derandomize=True
+)
 TestAnySession = AnySession.TestCase
 
 
@@ -199,7 +201,11 @@ def test_forty_actions_can_be_undone_and_no_more():
 def test_what_is_refused_changes_nothing_and_says_why():
     timeline = fake_timeline()
     before = state_of(timeline)
-    for command, why in ((Undo(), "Nothing to undo"), (Redo(), "Nothing to redo"), (GoTo(state=3), "no such")):
+    for command, why in (
+        (Undo(), "Nothing to undo"),
+        (Redo(), "Nothing to redo"),
+        (GoTo(state=3), "no such"),
+    ):
         timeline.apply(command)
         (event,) = timeline.frame().events
         assert isinstance(event, Refused) and why in event.reason and event.command == command
