@@ -47,6 +47,9 @@ def big_ball() -> trimesh.Trimesh:
     return trimesh.creation.icosphere(subdivisions=4, radius=R)
 
 
+BALL = big_ball()
+
+
 def from_above() -> np.ndarray:
     return frame_towards(np.zeros(3), Z, X)
 
@@ -107,7 +110,7 @@ def case_of_ball(**changes) -> Case:
         scene=Scene(anatomy={}),
         probe=PROBE,
         origin=ORIGIN,
-        organ=big_ball(),
+        organ=BALL,
         tumour=None,
         parts={},
         shapes=(),
