@@ -1,15 +1,17 @@
-"""A ball under a probe, plans over it, and what stands for the processes that try them."""
+"""A ball under a probe, and plans over it."""
 
 from itertools import pairwise
-from types import SimpleNamespace
 
 import numpy as np
 import trimesh
 
+from rehearsal.case import Case
+from rehearsal.loop.frame import Event, Frame
 from rehearsal.planning.plan_file import LIFT_MM, Plan, PlannedSweep
+from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.sweep_path import frame_towards
 from rehearsal.planning.sweep_score import ScoreTerms
-from scenes.scene import Trocar
+from scenes.scene import Press, Scene, Trocar
 from ultrasound.probe import load_probe
 from ultrasound.probe_manipulator import ProbeManipulator, advanced, image_plane, pose_at
 
@@ -17,6 +19,7 @@ R = 30.0
 SIZE = np.array([16.0, 9.0, 20.0])
 ORIGIN = np.array([100.0, -200.0, 300.0])
 X, Y, Z = np.eye(3)
+PROBE = load_probe("linear").model_copy(update=dict(housing_mm=tuple(SIZE)))
 # The ball's facets lie up to 2.2^2 / (8 R) = 0.02 mm inside it, and its patches' normals half a degree beside its radii.
 FACET_MM, NORMAL_DEG = 0.03, 0.5
 GOOD = ScoreTerms(
@@ -42,6 +45,9 @@ def manipulator_on(mesh: trimesh.Trimesh, size_mm: np.ndarray = SIZE) -> ProbeMa
 
 def big_ball() -> trimesh.Trimesh:
     return trimesh.creation.icosphere(subdivisions=4, radius=R)
+
+
+BALL = big_ball()
 
 
 def from_above() -> np.ndarray:
@@ -98,12 +104,27 @@ def plan_of(*sweeps: PlannedSweep, **changes) -> Plan:
     return Plan(**(values | changes))
 
 
-def over_ball() -> SimpleNamespace:
-    """What a guide and a plan's poses ask of a rehearsal; its organ is far below all ways."""
-    far = big_ball().apply_translation([0.0, 0.0, -1000.0])
-    return SimpleNamespace(
-        size_mm=SIZE,
+def case_of_ball(**changes) -> Case:
+    """The ball in a patient, its middle at ORIGIN."""
+    values = dict(
+        scene=Scene(anatomy={}),
+        probe=PROBE,
         origin=ORIGIN,
-        manipulator=manipulator_on(far),
-        settings=SimpleNamespace(time_step_s=0.05),
+        organ=BALL,
+        tumour=None,
+        parts={},
+        shapes=(),
+        press=Press(direction=-Z, lateral=X),
     )
+    return Case(**(values | changes))
+
+
+def guide_over_ball(plan: Plan) -> PlanGuidance:
+    """A guide over an organ that is far below all ways."""
+    far = big_ball().apply_translation([0.0, 0.0, -1000.0])
+    return PlanGuidance(case_of_ball(), manipulator_on(far), plan)
+
+
+def frame_at(pose: np.ndarray, number: int = 0, time_s: float = 0.0, *events: Event) -> Frame:
+    """A frame without tissue."""
+    return Frame(number, time_s, pose, np.zeros((0, 3), np.float32), geometry=None, events=events)

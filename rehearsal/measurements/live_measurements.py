@@ -16,7 +16,7 @@ from rehearsal.measurements.uncertainty_bands import UncertaintyBands
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.resection.judgement import findings_of
 from rehearsal.sessions.packed_arrays import unpack_seen
-from rehearsal.sessions.session_file import Log, SessionError
+from rehearsal.sessions.session_file import Log, SessionError, makes_state
 from render.viewer import Settings, View
 from ultrasound.coverage import GRID_POINTS, Coverage, Gap
 from ultrasound.probe import Probe
@@ -86,8 +86,10 @@ class LiveMeasurements:
         for number, command in log.commands:
             if number >= until:
                 break
-            if number in log.readings:
-                self.latest = _recorded_measurement(log.readings[number])
+            # Each step counts with what was measured after it.
+            for at in (number, number + makes_state(command)):
+                if at in log.readings:
+                    self.latest = _recorded_measurement(log.readings[at])
             if isinstance(command, Move):
                 if self.guide is not None:
                     self.guide.follow(command.pose)

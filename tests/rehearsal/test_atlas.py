@@ -7,14 +7,13 @@ import pytest
 import trimesh
 from conftest import ROOT
 
-import rehearsal.pose_scans
-import rehearsal.rehearsal
 from app import main
-from rehearsal.rehearsal import Rehearsal, scanned_anatomy
-from rehearsal.sessions.recorder import recorded_values
-from rehearsal.sessions.session_file import Header
+from rehearsal import deformed_anatomy, pose_scans
+from rehearsal.case import case_of
+from rehearsal.deformed_anatomy import scanned_anatomy, scanned_ct
+from rehearsal.sessions.session_file import Header, recorded_values, scene_of_log
 from scenes.anatomy import Grid, LoadedAnatomy, load_anatomy
-from scenes.scene import EMBEDDED, Scene, SceneError, load_scene, scene_text, with_options
+from scenes.scene import EMBEDDED, SceneError, load_scene, scene_text, with_options
 
 pytestmark = pytest.mark.usefixtures("arrays_stored")
 
@@ -57,15 +56,16 @@ def asked(monkeypatch):
     def seen(organ, ct, anatomy, origin, draws):
         raise Seen(draws)
 
-    for module in (rehearsal.pose_scans, rehearsal.rehearsal):
+    for module in (pose_scans, deformed_anatomy):
         monkeypatch.setattr(module, "scanned_anatomy", seen)
 
 
 @pytest.mark.parametrize("is_on", [True, False])
 def test_a_rehearsal_asks_for_what_its_scene_says(asked, is_on):
     scene = with_options(load_scene(EMBEDDED), {"image.atlas": is_on})
+    anatomy = load_anatomy(scene, EMBEDDED.parent)
     with pytest.raises(Seen) as error:
-        Rehearsal(scene, load_anatomy(scene, EMBEDDED.parent))
+        scanned_ct(case_of(scene, anatomy), anatomy)
     assert error.value.args == (is_on,)
 
 
@@ -85,7 +85,7 @@ def test_it_is_recorded_and_replayed():
     recorded = json.loads(json.dumps(recorded_values(scene)))
     assert recorded["image"]["atlas"] is False
     header = Header(anatomy="", scene=recorded, probe={}, arch="cpu", time_step_s=0.02)
-    assert not Scene.model_validate(header.scene | {"anatomy": {"phantom": True}}).image.atlas
+    assert not scene_of_log(header, load_scene(EMBEDDED)).image.atlas
 
 
 def test_a_scene_has_it_and_other_words_are_refused(tmp_path):

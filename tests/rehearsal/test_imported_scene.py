@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from rehearsal.sessions.session import Session
 from synthetic_body import LEFT, RIGHT, TUMOUR, body, coarsely, drawn
 
+from rehearsal.case import case_of
+from rehearsal.deformed_anatomy import DeformedAnatomy
+from rehearsal.loop.command import Move
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.pressed_organ import PressedOrgan
 from rehearsal.rehearsal import Rehearsal
@@ -23,6 +25,7 @@ from scenes.patients.readers.segment_choice import assign_tissues
 from scenes.scene import Scene, load_scene, scene_text, with_options
 from scenes.surfaces import save_surface
 from scenes.volumes.lazy_volume import LazyVolume
+from ultrasound.coverage import GRID_POINTS, Coverage
 from ultrasound.probe_manipulator import advanced, touching
 
 SINUS = np.array([62.0, 35.0, 12.0]), np.array([13.0, 10.0, 22.0])
@@ -65,9 +68,10 @@ def pressed(scene: Scene, folder: Path, depth_mm: float = 8.0) -> PressedOrgan:
     """The organ, settled and pressed."""
     press = scene.press.model_copy(update=dict(warm_up_steps=20))
     anatomy = load_anatomy(scene, folder)
-    organ = PressedOrgan(scene.model_copy(update=dict(press=press)), anatomy)
+    case = case_of(scene.model_copy(update=dict(press=press)), anatomy)
+    organ = PressedOrgan(case)
     organ.settle()
-    start = touching(organ._press_pose(), organ.size_mm, np.asarray(organ.organ.vertices))
+    start = touching(case.press_pose, case.size_mm, np.asarray(case.organ.vertices))
     for depth in [*np.linspace(-2.0, depth_mm, 50), *[depth_mm] * 20]:
         organ.advance(advanced(start, depth))
         assert organ.notice == ""
@@ -123,13 +127,11 @@ def test_a_stiff_tumour_stays_higher_under_the_probe(device, patient, folder):
     height = {}
     for uniform in (True, False):
         organ = pressed(scene_of(patient, folder, "tumour", uniform=uniform), folder)
-        lattice = organ.model.lattice
-        rest = patient.tumour.vertices - organ.origin
-        along = lattice.carried(np.asarray(rest), organ.body.snapshot().position) @ np.array(
-            organ.press.direction
-        )
+        rest, direction = patient.tumour.vertices - organ.case.origin, np.array(organ.case.press.direction)
+        interpolation = organ.model.carrier.interpolation
+        along = interpolation.carried(np.asarray(rest), organ.body.snapshot().position) @ direction
         height[uniform] = np.ptp(along)
-    before = np.ptp(patient.tumour.vertices @ np.array(organ.press.direction))
+    before = np.ptp(patient.tumour.vertices @ direction)
     assert height[True] < before - 1.5 and height[False] > height[True] + 0.4
 
 
@@ -155,22 +157,29 @@ def test_shape_matching_has_no_parts(device, patient, folder):
 def opened(scene: Scene, folder: Path) -> Rehearsal:
     image = scene.image.model_copy(update=dict(pixels=64))
     press = scene.press.model_copy(update=dict(warm_up_steps=60))
-    return Rehearsal(scene.model_copy(update=dict(image=image, press=press)), load_anatomy(scene, folder))
+    anatomy = load_anatomy(scene, folder)
+    return Rehearsal(case_of(scene.model_copy(update=dict(image=image, press=press)), anatomy), anatomy)
 
 
 @pytest.mark.parametrize("parts", [("tumour",), ()])
 def test_it_opens_in_contact_with_a_picture(device, patient, folder, parts):
     rehearsal = opened(scene_of(patient, folder, *parts), folder)
-    assert "Drop-in" in rehearsal.probe.transducer_name
-    rehearsal.advance(rehearsal.scripted_pose(0.0))
-    rehearsal.update_surfaces()
-    look = rehearsal.image_plane(), rehearsal.probe, "b-mode", "speckle", 350.0, 40.0
-    image = rehearsal.scanner.images(*look).by_name
-    measurements = LiveMeasurements(rehearsal)
-    measurements.watch(Session(rehearsal), rehearsal.probe)
-    assert measurements._touches.mean() > 0.8
+    anatomy, probe = rehearsal.anatomy, rehearsal.case.probe
+    assert "Drop-in" in probe.transducer_name
+    frame = rehearsal.do(Move(pose=rehearsal.scripted_pose(0.0)))
+    look = anatomy.image_plane(), probe, "b-mode", "speckle", 350.0, 40.0
+    image = anatomy.scanner.images(*look).by_name
+    assert touched_share(anatomy) > 0.8
+    measurements = LiveMeasurements(anatomy, rehearsal.manipulator)
+    measurements.observe(frame, probe)
     assert measurements.latest.contact_mm2 > 5 and measurements.latest.force_n <= MOST_FORCE_N
     assert (image["B-mode"] > 12).mean() > 0.5
-    for _ in range(20):
-        rehearsal.advance(rehearsal.manipulator.pose())
-    assert np.linalg.norm(rehearsal.wrench()[:3]) <= MOST_FORCE_N
+    frame = rehearsal.do(*[Move(pose=rehearsal.manipulator.pose())] * 20)
+    assert np.linalg.norm(frame.wrench[:3]) <= MOST_FORCE_N
+
+
+def touched_share(anatomy: DeformedAnatomy) -> float:
+    """The share of the scanlines in contact."""
+    case = anatomy.case
+    rest = anatomy.scanner.plane.rest_grid(GRID_POINTS)
+    return Coverage(case.organ, None).add(rest, case.probe, case.scene.image.coupling_gap_mm).mean()

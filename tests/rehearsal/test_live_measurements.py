@@ -1,176 +1,170 @@
-"""What the instruments read off a rehearsal, and make of a plan and of a session that is opened in its midst."""
+"""What is measured of a rehearsal, what becomes of a plan, and of a session that is opened in its midst."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
-from plan_ball import Z, over_ball, plan_of, straight_pass, sweep_of
+from plan_ball import Z, case_of_ball, frame_at, guide_over_ball, plan_of, straight_pass, sweep_of
 
+from rehearsal.loop.command import Move, Undo
+from rehearsal.loop.frame import Applied, Checkpointed, Step
+from rehearsal.loop.state import WholeState
 from rehearsal.measurements import live_measurements
-from rehearsal.measurements.live_measurements import LiveMeasurements
+from rehearsal.measurements.live_measurements import MEASURE_S, LiveMeasurements
 from rehearsal.measurements.tumour_measurements import Measurement
-from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.sessions.packed_arrays import pack_seen
-from rehearsal.sessions.session_file import Event, Log, SessionError
+from rehearsal.sessions.session_file import Header, Log, SessionError
 from render.viewer import Settings, View
 from ultrasound.probe import load_probe
 
+PROBE, VIEW = load_probe("linear"), View(np.eye(4), {}, 40.0, 60.0)
 FIRST, SECOND = straight_pass(4, step_mm=2.0), straight_pass(3, 20.0, 2.0)
+pytestmark = pytest.mark.usefixtures("one_device")
 
 
 @pytest.fixture
-def rehearsal() -> SimpleNamespace:
+def anatomy() -> SimpleNamespace:
+    """What is measured of an anatomy: a ball whose images are far beside it."""
     organ = trimesh.creation.icosphere(subdivisions=3, radius=25.0)
     tumour = trimesh.creation.icosphere(subdivisions=3, radius=6.0).apply_translation(12 * Z)
-    image = SimpleNamespace(coupling_gap_mm=None)
-    scene = SimpleNamespace(image=image, transducer=SimpleNamespace(compression_warning_mm=8.0))
     plane = SimpleNamespace(rest_grid=lambda count: np.full((count, count, 3), 500.0, np.float32))
     return SimpleNamespace(
-        **vars(over_ball())
-        | dict(
-            organ=organ,
-            tumour=tumour,
-            whole_organ=organ,
-            whole_tumour=tumour,
-            cut=None,
-            judgement=None,
-            scene=scene,
-            probe=load_probe("linear"),
-        ),
+        case=case_of_ball(organ=organ, tumour=tumour, probe=PROBE),
+        organ=organ,
+        tumour=tumour,
+        judgement=None,
         scanner=SimpleNamespace(plane=plane),
         pose=FIRST[0],
     )
 
 
 @pytest.fixture
-def watching(monkeypatch, rehearsal) -> LiveMeasurements:
+def measurements(monkeypatch, anatomy) -> LiveMeasurements:
     monkeypatch.setattr(live_measurements, "measure", lambda *_: Measurement(1.0, 20.0))
-    return LiveMeasurements(
-        rehearsal, PlanGuidance(rehearsal, plan_of(sweep_of(FIRST, SECOND), margin_mm=8.0))
-    )
+    return guided(anatomy)
 
 
-def test_the_instruments_watch_the_guide_and_record_it(watching, rehearsal, one_device):
+def guided(anatomy) -> LiveMeasurements:
+    guide = guide_over_ball(plan_of(sweep_of(FIRST, SECOND), margin_mm=8.0))
+    return LiveMeasurements(anatomy, guide.manipulator, guide)
+
+
+def observed(measurements: LiveMeasurements, *poses: np.ndarray) -> None:
+    """A frame of a step to each pose, so long that each is measured."""
+    for number, pose in enumerate(poses):
+        step = Step(number, pose, MEASURE_S, 4, 1.0)
+        measurements.observe(frame_at(pose, number + 1, (number + 1) * MEASURE_S, step), PROBE)
+
+
+def undone(at: int, time_s: float):
+    return frame_at(FIRST[0], at + 1, time_s, Applied(at, Undo(), restored=0))
+
+
+def test_the_guide_is_followed_and_its_figures_are_recorded(measurements):
     noted: list[dict] = []
-    session = SimpleNamespace(
-        time_s=0.0, kept_states={}, rolled_back_to=None, note=lambda name, figures: noted.append(figures)
-    )
-    for pose in FIRST:
-        rehearsal.pose = pose
-        watching.watch(session, rehearsal.probe)
-        session.time_s += live_measurements.MEASURE_S
+    measurements.note = lambda number, reading: noted.append(reading)
+    observed(measurements, *FIRST)
     assert [round(each["plan_followed"], 3) for each in noted] == [round(n / 7, 3) for n in (1, 2, 3, 4)]
     assert all(each["plan_off_mm"] == 0 and "seen_margin" in each for each in noted)
-    view = watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings())
+    view = measurements.onto(VIEW, Settings())
     assert view.guidance.goal == pytest.approx(SECOND[0]) and view.findings["plan"] == "57 %"
-    watching.restart()
-    assert watching.guide.next_pose == 0
-    watching.guide = None
-    assert watching.onto(view, Settings()).guidance is None and "plan_followed" not in watching.figures()
+    measurements.restart()
+    assert measurements.guide.next_pose == 0
+    measurements.guide = None
+    assert measurements.onto(view, Settings()).guidance is None
+    assert "plan_followed" not in measurements.figures()
 
 
-def test_what_a_session_holds_is_recalled_as_it_was_watched(watching, rehearsal, one_device, monkeypatch):
+def test_what_a_session_holds_is_recalled_as_it_was_measured(measurements, anatomy, monkeypatch):
     # The first is no press: as it is noted it is 1 mm.
-    squeezed = iter([1.00004, 0.3, 9.0, 0.2])
+    squeezed = iter([1.00004, 0.3, 9.0, 0.2, 0.1])
     monkeypatch.setattr(
         live_measurements, "measure", lambda *_: Measurement(next(squeezed), 20.0, 5.0, 2.0, 1.0)
     )
-    events: dict[int, list] = {}
-    session = SimpleNamespace(step_index=0, time_s=0.0, kept_states={}, rolled_back_to=None)
-    session.note = lambda kind, value: events.setdefault(session.step_index, []).append(
-        Event(at=session.step_index, kind=kind, value=value)
-    )
-    for session.step_index, rehearsal.pose in enumerate(FIRST, 1):
-        session.time_s += live_measurements.MEASURE_S
-        watching.watch(session, rehearsal.probe)
-        watching.count(rehearsal.pose, live_measurements.MEASURE_S)
-    watching.count(None, live_measurements.MEASURE_S)
-    watching.coverage.seen[watching.coverage.targets["tumour"]] = True
-    lengths_s = np.full(5, live_measurements.MEASURE_S)
-    log = Log(None, np.stack([*FIRST, np.full((4, 4), np.nan)]), lengths_s, events)
-    again = LiveMeasurements(rehearsal, PlanGuidance(rehearsal, watching.guide.plan))
+    moves = [(number, Move(pose=pose, length_s=MEASURE_S)) for number, pose in enumerate(FIRST)]
+    header = Header(anatomy="", scene={}, probe={}, arch="cpu", time_step_s=0.02)
+    log = Log(header, [*moves, (4, Undo())])
+    measurements.note = log.readings.__setitem__
+    observed(measurements, *FIRST)
+    measurements.observe(undone(4, 4 * MEASURE_S), PROBE)
+    measurements.guide.follow(FIRST[-1])
+    measurements.coverage.seen[measurements.coverage.targets["tumour"]] = True
+    again = guided(anatomy)
     assert again.recall(log, 0) and not again.recall(log, 5) and again.course.duration_s == 0
-    log.seen[5] = pack_seen(watching.coverage.seen)
+    log.seen[5] = pack_seen(measurements.coverage.seen)
     assert again.recall(log, 5)
-    assert again.figures() == watching.figures() and again.summary(2) == watching.summary(2)
+    assert again.figures() == measurements.figures() and again.summary(2) == measurements.summary(2)
     assert (again.course.presses, again.course.went_back, again.guide.next_pose) == (1, 1, 4)
-    view = again.onto(View(np.eye(4), {}, 40.0, 60.0), Settings(show_seen=True))
+    view = again.onto(VIEW, Settings(show_seen=True))
     assert view.findings["tumour volume seen"] == "100 %" and view.seen["tumour"].any()
-    del log.events[1][0].value["contact_mm2"]
+    del log.readings[1]["contact_mm2"]
     with pytest.raises(SessionError, match="without compression or contact"):
-        LiveMeasurements(rehearsal).recall(log, 5)
+        guided(anatomy).recall(log, 5)
 
 
-def test_a_way_back_is_looked_at_and_read_anew_at_once(watching, rehearsal, one_device, monkeypatch):
+def test_after_an_undo_it_is_measured_anew_at_once(measurements, monkeypatch):
     depths = iter([9.0, 0.2])
     monkeypatch.setattr(live_measurements, "measure", lambda *_: Measurement(next(depths), 20.0))
-    lines = np.ones(rehearsal.probe.number_of_scanlines, bool)
+    lines = np.ones(PROBE.number_of_scanlines, bool)
     looks = iter([lines, ~lines])
-    monkeypatch.setattr(watching.coverage, "add", lambda *_: next(looks))
+    monkeypatch.setattr(measurements.coverage, "add", lambda *_: next(looks))
     noted: list[float] = []
-    session = SimpleNamespace(time_s=0.0, kept_states={}, rolled_back_to=None)
-    session.note = lambda kind, figures: noted.append(figures["compression_mm"])
-    for session.time_s, is_rollback in ((0.0, False), (1 / 60, False), (1 / 45, True)):
-        watching.watch(session, rehearsal.probe, is_rollback)
-    view = watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings())
+    measurements.note = lambda number, reading: noted.append(reading["compression_mm"])
+    for frame in (frame_at(FIRST[0]), frame_at(FIRST[0], 1, 1 / 60), undone(1, 1 / 60)):
+        measurements.observe(frame, PROBE)
+    view = measurements.onto(VIEW, Settings())
     assert view.findings["compression"] == "0.2 mm" and noted == [9.0, 0.2] and view.notes
     assert view.alert == ""
 
 
-def test_a_session_that_begins_is_read_with_what_touches_then(watching, rehearsal, one_device, monkeypatch):
-    """Though its first moment is none at which it would be looked."""
+def test_a_session_that_begins_is_measured_with_what_touches_then(measurements, monkeypatch):
+    """Though nothing is due at the time of its first frame."""
     given = []
     monkeypatch.setattr(
         live_measurements, "measure", lambda *asked: given.append(asked[-1]) or Measurement(1.0, 20.0)
     )
-    touches = np.arange(rehearsal.probe.number_of_scanlines) < 30
-    monkeypatch.setattr(watching.coverage, "add", lambda *_: touches)
+    touches = np.arange(PROBE.number_of_scanlines) < 30
+    monkeypatch.setattr(measurements.coverage, "add", lambda *_: touches)
+    begins = Checkpointed(0, WholeState(organ=None), begins=True)
     for _ in range(2):
-        session = SimpleNamespace(time_s=1 / 60, kept_states={}, rolled_back_to=None, note=lambda *_: None)
-        watching.watch(session, rehearsal.probe)
-        watching.restart()
+        measurements.observe(frame_at(FIRST[0], 1, 1 / 60, begins), PROBE)
     assert len(given) == 2 and all(np.array_equal(each, touches) for each in given)
 
 
-def test_another_plan_brings_its_margin_and_what_was_seen_stays(watching, rehearsal, one_device):
-    volume = watching.coverage.targets["margin"].sum()
-    watching.coverage.seen[watching.coverage.targets["tumour"]] = True
-    before = watching.coverage
-    watching.follow(PlanGuidance(rehearsal, plan_of(margin_mm=8.0)))
-    assert watching.coverage is before
-    watching.follow(PlanGuidance(rehearsal, plan_of(margin_mm=2.0)))
-    assert watching.margin_mm == 2.0 and watching.coverage.targets["margin"].sum() < volume / 2
-    assert watching.coverage.fraction("tumour") == 1.0 and watching.guide.plan.margin_mm == 2.0
-    assert LiveMeasurements(rehearsal).margin_mm == live_measurements.MARGIN_MM
+def test_another_plan_brings_its_margin_and_what_was_seen_stays(measurements, anatomy):
+    volume = measurements.coverage.targets["margin"].sum()
+    measurements.coverage.seen[measurements.coverage.targets["tumour"]] = True
+    before = measurements.coverage
+    measurements.follow(guide_over_ball(plan_of(margin_mm=8.0)))
+    assert measurements.coverage is before
+    measurements.follow(guide_over_ball(plan_of(margin_mm=2.0)))
+    assert measurements.margin_mm == 2.0 and measurements.coverage.targets["margin"].sum() < volume / 2
+    assert measurements.coverage.fraction("tumour") == 1.0 and measurements.guide.plan.margin_mm == 2.0
+    assert LiveMeasurements(anatomy, measurements.manipulator).margin_mm == live_measurements.MARGIN_MM
 
 
 @pytest.mark.parametrize(
     ("touching", "notes"), [(0, {"B-mode": "NO CONTACT"}), (9, {"B-mode": "NO CONTACT"}), (10, {})]
 )
-def test_an_echo_is_said_to_be_black_where_hardly_a_line_touches(
-    one_device, watching, rehearsal, monkeypatch, touching, notes
+def test_an_image_is_said_to_have_no_contact_where_hardly_a_line_touches(
+    measurements, monkeypatch, touching, notes
 ):
-    touches = np.arange(rehearsal.probe.number_of_scanlines) < touching
-    monkeypatch.setattr(watching.coverage, "add", lambda *_: touches)
-    watching.watch(
-        SimpleNamespace(time_s=0.0, kept_states={}, rolled_back_to=None, note=lambda *_: None),
-        rehearsal.probe,
-    )
-    assert watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings()).notes == notes
+    touches = np.arange(PROBE.number_of_scanlines) < touching
+    monkeypatch.setattr(measurements.coverage, "add", lambda *_: touches)
+    measurements.observe(frame_at(FIRST[0]), PROBE)
+    assert measurements.onto(VIEW, Settings()).notes == notes
 
 
-def test_the_panel_shows_each_figure_under_its_name_with_its_unit(
-    one_device, watching, rehearsal, monkeypatch
-):
-    watching.guide = None
+def test_the_panel_shows_each_figure_under_its_name_with_its_unit(measurements, monkeypatch):
+    measurements.guide = None
     shares = dict(organ=0.123, tumour=0.456, margin=0.789)
-    monkeypatch.setattr(watching.coverage, "fraction", shares.get)
+    monkeypatch.setattr(measurements.coverage, "fraction", shares.get)
     always = {"compression": "8.3 mm", "contact": "123 mm2", "force": "0.52 N"}
-    watching.latest = Measurement(8.26, 123.4, force_n=0.517, torque_n_mm=9.9)
-    assert watching.findings() == always | {"organ seen": "12 %"}
-    watching.latest = Measurement(8.26, 123.4, 20.11, 7.27, 3.38, 0.37, -4.96, 0.517, 9.9)
-    assert watching.findings() == always | {
+    measurements.latest = Measurement(8.26, 123.4, force_n=0.517, torque_n_mm=9.9)
+    assert measurements.findings() == always | {"organ seen": "12 %"}
+    measurements.latest = Measurement(8.26, 123.4, 20.11, 7.27, 3.38, 0.37, -4.96, 0.517, 9.9)
+    assert measurements.findings() == always | {
         "to tumour": "20.1 mm",
         "tumour depth": "7.3 mm",
         "tumour shift": "3.4 mm",
@@ -179,11 +173,11 @@ def test_the_panel_shows_each_figure_under_its_name_with_its_unit(
         "tumour volume seen": "46 %",
         "+8 mm seen": "79 %",
     }
-    shown = watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings())
+    shown = measurements.onto(VIEW, Settings())
     assert (shown.alert, shown.status) == ("compression", "TISSUE COMPRESSED BY 8 mm")
     # The scene's limit is 8 mm.
-    watching.latest = Measurement(8.0, 123.4)
-    shown = watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings())
+    measurements.latest = Measurement(8.0, 123.4)
+    shown = measurements.onto(VIEW, Settings())
     assert (shown.alert, shown.status) == ("", "")
 
 
@@ -191,6 +185,6 @@ def test_the_panel_shows_each_figure_under_its_name_with_its_unit(
     ("in_view", "margin", "shown"),
     [(0.5, -0.04, "0.0 mm"), (0.5, 0.0, "0.0 mm"), (0.5, -0.06, "-0.1 mm"), (0.0, 1.0, ""), (None, None, "")],
 )
-def test_a_margin_of_nothing_has_no_minus(one_device, watching, in_view, margin, shown):
-    watching.latest = Measurement(1.0, 20.0, 5.0, 2.0, 1.0, in_view, margin)
-    assert watching.findings()["margin"] == shown
+def test_a_margin_of_nothing_has_no_minus(measurements, in_view, margin, shown):
+    measurements.latest = Measurement(1.0, 20.0, 5.0, 2.0, 1.0, in_view, margin)
+    assert measurements.findings()["margin"] == shown

@@ -435,17 +435,15 @@ def test_a_pose_that_is_not_rigid_is_refused_with_one_warning(said, matrix):
 
 def test_the_first_image_of_a_view_is_sent_with_the_current_probe():
     shown: list[LiveImage] = []
-    plane, origin = pose(), np.array([10.0, 20.0, 30.0])
     wrench = np.array([1.0, 2.0, -3.0, 0.0, 5.0, 6.0])
-    rehearsal = SimpleNamespace(
-        image_plane=lambda: SimpleNamespace(world_from_plane=plane), origin=origin, wrench=lambda: wrench
-    )
+    frame = SimpleNamespace(time_s=1.5, wrench=wrench)
+    anatomy = SimpleNamespace(probe_in_patient=pose, frame=frame)
     echo, ct = np.full((8, 6), 9, np.uint8), np.zeros((8, 6), np.uint8)
     probe = load_probe("linear").model_copy(update=dict(depth_mm=80.0, transducer_width_mm=30.0))
-    send_live(None, rehearsal, SimpleNamespace(images={"B-mode": echo}), probe, 1.5)
+    send_live(None, anatomy, SimpleNamespace(images={"B-mode": echo}), probe)
     link = SimpleNamespace(send=lambda *live: shown.append(LiveImage(*live)))
-    send_live(link, rehearsal, SimpleNamespace(images={"B-mode": echo, "CT": ct}), probe, 1.5)
+    send_live(link, anatomy, SimpleNamespace(images={"B-mode": echo, "CT": ct}), probe)
     (sent,) = shown
     assert sent.grey is echo and sent.time_s == 1.5 and sent.wrench is wrench
-    assert np.allclose(sent.probe_in_patient[:3, 3], plane[:3, 3] + origin)
+    assert np.array_equal(sent.probe_in_patient, pose())
     assert np.allclose(np.diag(sent.image_to_probe), [30 / 6, 80 / 8, 1, 1])

@@ -4,20 +4,24 @@ import base64
 import io
 import zipfile
 from contextlib import suppress
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
 import pytest
-from test_undo_history import STEP_S, Numbers
+from fake_organ import STEP_S
 
+from rehearsal.loop.state import WholeState
 from rehearsal.measurements.session_summary import SessionCourse, summary_text
+from rehearsal.pressed_organ import OrganState
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.resection_state import CutRequest, Resection
 from rehearsal.sessions import packed_arrays
 from rehearsal.sessions.packed_arrays import StateError, pack_state, unpack_state
+from sim.body import BodyState
+from sim.divergence_check import DivergenceState
+from sim.solver import SolverState
 from ultrasound.coverage import Gap
-from ultrasound.probe_manipulator import ManipulatorState
 
 
 def arrays_of(state: Any) -> list[np.ndarray]:
@@ -29,27 +33,32 @@ def arrays_of(state: Any) -> list[np.ndarray]:
     return [np.asarray(state)]
 
 
-def before_cut(numbers: Numbers) -> np.ndarray:
-    """Positions of the nodes when they were cut."""
-    return np.arange(numbers.position.size, dtype=np.float32).reshape(-1, 3) / 3
+POSITIONS = np.arange(6, dtype=np.float32).reshape(2, 3) / 3
 
 
-@pytest.mark.parametrize("aim", [None, np.diag([-0.0, 1 / 3, 5e-324, 1.0])])
-def test_a_state_as_text_keeps_every_bit(aim):
-    numbers = Numbers()
-    for _ in range(15):
-        numbers.advance(numbers.pose_towards(np.eye(4)))
-    numbers.watch = replace(numbers.watch, steps_tangled=3, is_restored=True, since_good_s=1 / 3)
-    numbers.velocity = np.array([[-0.0, 1e-45, np.inf], [np.nan, 1 / 3, -7]], np.float32)
-    numbers.manipulator.state = ManipulatorState(0.1, 2.3, (1 / 3, -4.0, 5.0), aim)
-    cut = CutRequest(CutSettings("wedge", 1 / 3, None, "air"), b"\x05", before_cut(numbers).tobytes())
-    before = replace(numbers.snapshot(), resection=Resection(((1 / 3, -0.0, 5e-324), (1.0, 2.0, 3.0)), cut))
-    pairs = list(
-        zip(arrays_of(before), arrays_of(unpack_state(pack_state(before), numbers.settled)), strict=True)
-    )
-    # Now and when last good: position, velocity and contacts; the watch's four; pose, steps; the hand's four; marks, and of the cut its
-    # four settings, what was seen, and the nodes.
-    assert len(pairs) == 2 * 3 + 4 + 2 + 4 + 1 + 4 + 2
+def solver_state(*velocity: list[float]) -> SolverState:
+    """Of two points in contact with a plane."""
+    friction = np.sin(np.pad(POSITIONS, ((0, 0), (0, 1))))
+    return SolverState(BodyState(POSITIONS, np.array(velocity, np.float32)), {"plane": friction})
+
+
+def state_of(*velocity: list[float]) -> WholeState:
+    """A state whose last valid one is another, with a cut."""
+    good = solver_state([1 / 3, 0, 0], [0, 1e-45, 0])
+    divergence = DivergenceState(good, 5, 3, True, 1 / 3)
+    organ = OrganState(solver_state(*velocity), divergence, np.diag([-0.0, 1 / 3, 5e-324, 1.0]), 15)
+    cut = CutRequest(CutSettings("wedge", 1 / 3, None, "air"), b"\x05", (POSITIONS / 7).tobytes())
+    return WholeState(organ, Resection(((1 / 3, -0.0, 5e-324), (1.0, 2.0, 3.0)), cut))
+
+
+STATE = state_of([-0.0, 1e-45, -2.5], [3.4e38, 1 / 3, -7])
+
+
+def test_a_state_as_text_keeps_every_bit():
+    pairs = list(zip(arrays_of(STATE), arrays_of(unpack_state(pack_state(STATE), POSITIONS)), strict=True))
+    # Now and when last good: position, velocity and contacts; the check's four; pose, steps; marks, and of the cut its four settings, what
+    # was seen, and the nodes; no manipulator.
+    assert len(pairs) == 2 * 3 + 4 + 2 + 1 + 4 + 2 + 1
     assert all(old.dtype == new.dtype and old.tobytes() == new.tobytes() for old, new in pairs)
 
 
@@ -60,34 +69,33 @@ def packed(**arrays: np.ndarray) -> str:
 
 
 def test_what_is_no_state_of_this_body_is_refused(monkeypatch):
-    numbers, random = Numbers(), np.random.default_rng(0)
-    text = pack_state(numbers.snapshot())
+    random, text = np.random.default_rng(0), pack_state(WholeState(STATE.organ))
     whole = base64.b64decode(text)
     arrays = dict(np.load(io.BytesIO(whole)))
     hostile = ["", "no state", text[:-40], packed(), packed(**arrays | {"pose": np.full((4, 4), np.nan)})]
+    # The history's shapes are those of a tissue model, which a timeline compares.
     for name, array in arrays.items():
+        if ".contacts." in name:
+            continue
         others = np.array(["a"]), np.array([{}]), np.stack([array, array])
         hostile += [packed(**arrays | {name: other}) for other in others]
-        without = packed(**{key: values for key, values in arrays.items() if key != name})
-        if name == "since_good_s":  # older sessions have none
-            assert unpack_state(without, numbers.settled).divergence.since_good_s == 0.0
-        else:
-            hostile.append(without)
+        if name != "good.position":  # without it the last valid state is the present one
+            hostile.append(packed(**{key: values for key, values in arrays.items() if key != name}))
     huge, npy = io.BytesIO(), io.BytesIO()
     np.lib.format.write_array_header_1_0(npy, dict(descr="<f8", fortran_order=False, shape=(10**15,)))
     with zipfile.ZipFile(huge, "w") as members:
         members.writestr("pose.npy", npy.getvalue())
     for each in [*hostile, base64.b64encode(huge.getvalue()).decode()]:
         with pytest.raises(StateError, match=r"^[^\n]+$"):
-            unpack_state(each, numbers.settled)
+            unpack_state(each, POSITIONS)
     for _ in range(300):
         flipped = bytearray(whole)
         flipped[random.integers(len(whole))] ^= 1 << random.integers(8)
         with suppress(StateError):
-            assert pack_state(unpack_state(base64.b64encode(flipped).decode(), numbers.settled)) == text
+            assert pack_state(unpack_state(base64.b64encode(flipped).decode(), POSITIONS)) == text
     monkeypatch.setattr(packed_arrays, "MOST_BYTES", 500)
     with pytest.raises(StateError, match="too large"):
-        unpack_state(text, numbers.settled)
+        unpack_state(text, POSITIONS)
 
 
 def test_a_course_counts_presses_ways_and_time_over_the_limit():

@@ -10,17 +10,17 @@ import trimesh
 from plan_ball import (
     FACET_MM,
     ORIGIN,
-    SIZE,
+    PROBE,
     X,
     Y,
     Z,
     big_ball,
+    case_of_ball,
     faces_in,
     in_patient,
     manipulator_on,
     sweep_of,
 )
-from rehearsal.coordinates import probe_in_patient
 
 from rehearsal.planning.pass_kinds import (
     LEAST_COSINE,
@@ -33,30 +33,22 @@ from rehearsal.planning.pass_kinds import (
     target_from,
 )
 from scenes.anatomy import LoadedAnatomy
+from scenes.scene import Press
 from sim.signed_distance import signed_distance
 from studies.planning import plan_comparison
 from studies.planning.baseline_sweeps import planned, random_sweep, row_by_row, straight
 from ultrasound.coverage import VOXEL_MM, Coverage
-from ultrasound.probe import load_probe
 
 pytestmark = pytest.mark.usefixtures("one_device")
 
 R, WIDTH = 30.0, 16.0
-PROBE = load_probe("linear").model_copy(update=dict(transducer_width_mm=WIDTH))
+NARROW = PROBE.model_copy(update=dict(transducer_width_mm=WIDTH))
 # Directions of a Fibonacci spiral are no farther from any than this.
 GRAIN_DEG = 9.0
 
 
 def everywhere(poses: np.ndarray) -> np.ndarray:
     return np.ones(len(poses), bool)
-
-
-@pytest.fixture(scope="module")
-def rehearsal(one_device) -> SimpleNamespace:
-    press = SimpleNamespace(direction=(0.0, 0.0, -1.0), lateral=(1.0, 0.0, 0.0))
-    return SimpleNamespace(
-        manipulator=manipulator_on(big_ball()), press=press, probe=PROBE, size_mm=SIZE, origin=ORIGIN
-    )
 
 
 def coverage_of(at: np.ndarray, radius: float = 7.0) -> Coverage:
@@ -68,12 +60,16 @@ def aside_by(degrees: float) -> np.ndarray:
     return np.array([0.0, np.sin(np.radians(degrees)), np.cos(np.radians(degrees))])
 
 
-def found_for(rehearsal, at: np.ndarray, reach=everywhere, radius: float = 7.0) -> list[PassKind]:
-    return kinds_of(trial_of(rehearsal, coverage_of(at, radius).voxel_centres("tumour"), reach))
+def found_for(at: np.ndarray, reach=everywhere, radius: float = 7.0) -> list[PassKind]:
+    return kinds_of(trial_of(coverage_of(at, radius).voxel_centres("tumour"), reach))
 
 
-def trial_of(rehearsal, places: np.ndarray, reach=everywhere) -> SimpleNamespace:
-    return SimpleNamespace(rehearsal=rehearsal, places=places, reach=reach)
+HAND = manipulator_on(big_ball())
+
+
+def trial_of(places: np.ndarray, reach=everywhere, lateral: np.ndarray = X) -> SimpleNamespace:
+    case = case_of_ball(probe=NARROW, press=Press(direction=-Z, lateral=lateral))
+    return SimpleNamespace(case=case, manipulator=HAND, places=places, reach=reach)
 
 
 def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
@@ -90,8 +86,8 @@ def test_directions_are_units_evenly_around():
     assert found.T @ found / 300 == pytest.approx(np.eye(3) / 3, abs=0.01)
 
 
-def test_a_tumour_on_top_has_passes_from_above_only(rehearsal):
-    found = found_for(rehearsal, 18.0 * Z)
+def test_a_tumour_on_top_has_passes_from_above_only():
+    found = found_for(18.0 * Z)
     assert [each.motion for each in found] == ["slide", "tilt"]
     assert all(each.side == "from above" for each in found)
     for each in found:
@@ -100,8 +96,8 @@ def test_a_tumour_on_top_has_passes_from_above_only(rehearsal):
 
 
 @pytest.mark.parametrize("aside", [40.0, -60.0])
-def test_a_tumour_at_the_side_has_passes_from_there_too(rehearsal, aside):
-    found = found_for(rehearsal, 18.0 * aside_by(aside))
+def test_a_tumour_at_the_side_has_passes_from_there_too(aside):
+    found = found_for(18.0 * aside_by(aside))
     assert [each.motion for each in found] == ["slide", "slide", "tilt"]
     assert found[0].frame[:3, 2] == pytest.approx(Z)
     for each in found[1:]:
@@ -109,36 +105,35 @@ def test_a_tumour_at_the_side_has_passes_from_there_too(rehearsal, aside):
         assert each.side == "from the nearest side"
 
 
-def test_no_side_is_below_the_organ(rehearsal):
-    outward = nearest_side(trial_of(rehearsal, -20.0 * Z[None]))
+def test_no_side_is_below_the_organ():
+    outward = nearest_side(trial_of(-20.0 * Z[None]))
     assert outward @ Z >= LEAST_COSINE
     assert angle_deg(outward, np.array([*outward[:2], 0.0]) / np.linalg.norm(outward[:2])) < 2 * GRAIN_DEG
 
 
-def test_the_nearest_side_is_one_that_can_be_reached(rehearsal):
+def test_the_nearest_side_is_one_that_can_be_reached():
     centre = 18.0 * aside_by(60)
 
     def from_left(poses: np.ndarray) -> np.ndarray:
         return poses[:, 1, 2] < -0.2
 
-    outward = nearest_side(trial_of(rehearsal, centre[None], from_left))
+    outward = nearest_side(trial_of(centre[None], from_left))
     assert outward[1] < -0.1
-    assert nearest_side(trial_of(rehearsal, centre[None], lambda poses: ~everywhere(poses))) is None
-    nowhere = found_for(rehearsal, centre, lambda poses: ~everywhere(poses))
+    assert nearest_side(trial_of(centre[None], lambda poses: ~everywhere(poses))) is None
+    nowhere = found_for(centre, lambda poses: ~everywhere(poses))
     assert len(nowhere) == 2 and all(each.side == "from above" for each in nowhere)
 
 
-def test_half_of_a_target_is_measured_across_and_along(rehearsal):
-    turned = SimpleNamespace(**vars(rehearsal) | dict(press=SimpleNamespace(lateral=Y)))
+def test_half_of_a_target_is_measured_across_and_along():
     places = np.array([[1.0, 1, 1], [4, 1, 9], [-2, 1, 1], [1, -6, 1], [1, 8, 3]])
-    frame, half, width, _ = target_from(trial_of(turned, places), Z)
+    frame, half, width, _ = target_from(trial_of(places, lateral=Y), Z)
     assert half == pytest.approx([7, 3]) and frame[:3, 3] == pytest.approx([1, 1, 3])
     assert width == pytest.approx(WIDTH)
 
 
-def test_passes_are_as_many_as_the_target_is_wide_in_pictures(rehearsal):
+def test_passes_are_as_many_as_the_target_is_wide_in_pictures():
     def needed(half: float) -> int:
-        return target_from(trial_of(rehearsal, half * np.array([X, -X])), Z)[3]
+        return target_from(trial_of(half * np.array([X, -X])), Z)[3]
 
     assert needed(0.4 * WIDTH) == 1
     counts = [needed(half) for half in np.arange(1.0, 200.0)]
@@ -146,8 +141,8 @@ def test_passes_are_as_many_as_the_target_is_wide_in_pictures(rehearsal):
 
 
 @pytest.mark.parametrize("motion", ["slide", "tilt"])
-def test_parameters_go_from_end_to_end_of_their_ranges(rehearsal, motion):
-    kind = kind_of(rehearsal, motion)
+def test_parameters_go_from_end_to_end_of_their_ranges(motion):
+    kind = kind_of(motion)
     low, high = (kind.values(np.full(len(RANGES[motion]), end)) for end in (-3.0, 7.0))
     for name, (least, greatest, *first) in RANGES[motion].items():
         assert (low[name], high[name]) == (least, greatest)
@@ -157,8 +152,8 @@ def test_parameters_go_from_end_to_end_of_their_ranges(rehearsal, motion):
 
 
 @pytest.mark.parametrize("motion", ["slide", "tilt"])
-def test_a_search_begins_with_passes_over_the_target(rehearsal, motion):
-    kind = kind_of(rehearsal, motion)
+def test_a_search_begins_with_passes_over_the_target(motion):
+    kind = kind_of(motion)
     random = kind.random(np.random.default_rng(3), 40)
     ends = ("start", "end") if motion == "slide" else ("first_deg", "last_deg")
     backwards = 0
@@ -171,13 +166,13 @@ def test_a_search_begins_with_passes_over_the_target(rehearsal, motion):
     assert backwards == 20
     assert np.array_equal(random, kind.random(np.random.default_rng(3), 40))
     for parameters in [*kind.rows(), *random]:
-        poses = kind.poses(rehearsal.manipulator, kind.values(parameters))
+        poses = kind.poses(HAND, kind.values(parameters))
         over = np.linalg.norm(np.cross(faces_in(poses) - kind.frame[:3, 3], kind.frame[:3, 2]), axis=1)
         assert over.max() < 3 * RADIUS
 
 
-def test_rows_lie_side_by_side_over_the_whole_target(rehearsal):
-    kind = kind_of(rehearsal, "slide")
+def test_rows_lie_side_by_side_over_the_whole_target():
+    kind = kind_of("slide")
     rows = [kind.values(each) for each in kind.rows()]
     assert [each["heading_deg"] for each in rows] == pytest.approx([0.0] * 5 + [90.0] * 5)
     assert all(each["lean_deg"] == each["lean_aside_deg"] == each["follow"] == 0.0 for each in rows)
@@ -192,8 +187,8 @@ def test_rows_lie_side_by_side_over_the_whole_target(rehearsal):
 RADIUS = 12.0
 
 
-def kind_of(rehearsal, motion: str) -> PassKind:
-    found = found_for(rehearsal, 16.0 * Z, radius=RADIUS)
+def kind_of(motion: str) -> PassKind:
+    found = found_for(16.0 * Z, radius=RADIUS)
     return next(each for each in found if each.motion == motion)
 
 
@@ -203,8 +198,8 @@ def values_of(kind: PassKind, **changes: float) -> dict[str, float]:
     return values | changes
 
 
-def test_sliding_follows_its_parameters(rehearsal):
-    slide, manipulator = kind_of(rehearsal, "slide"), rehearsal.manipulator
+def test_sliding_follows_its_parameters():
+    slide, manipulator = kind_of("slide"), HAND
     across, along = slide.half_mm
     numbers = values_of(slide, aside=0.25, start=-0.6, end=0.5)
     one = faces_in(slide.poses(manipulator, numbers)) - slide.frame[:3, 3]
@@ -224,28 +219,28 @@ def test_sliding_follows_its_parameters(rehearsal):
     assert beside.poses(manipulator, numbers | dict(aside=1.0)) is None
 
 
-def test_a_sweep_has_few_passes_or_as_many_as_a_wide_target_needs(rehearsal):
-    kind = kind_of(rehearsal, "slide")
+def test_a_sweep_has_few_passes_or_as_many_as_a_wide_target_needs():
+    kind = kind_of("slide")
     for half, most in (([5.0, 5.0], 4), ([30.0, 50.0], 4), ([45.0, 39.0], 5), ([900.0, 900.0], MOST_PASSES)):
         assert replace(kind, half_mm=np.array(half), width_mm=16.0).most_passes == most
     point = replace(kind, half_mm=np.zeros(2))
     assert [point.values(each)["aside"] for each in point.rows()] == [0.0, -0.5, 0.5] * 2
 
 
-def test_half_of_the_extent_across_and_along_depends_on_the_heading(rehearsal):
-    slide = replace(kind_of(rehearsal, "slide"), half_mm=np.array([7.0, 3.0]))
+def test_half_of_the_extent_across_and_along_depends_on_the_heading():
+    slide = replace(kind_of("slide"), half_mm=np.array([7.0, 3.0]))
     assert slide.extent_mm(0.0) == pytest.approx((7, 3)) and slide.extent_mm(-90.0) == pytest.approx((3, 7))
     assert slide.extent_mm(45.0) == pytest.approx((10 / np.sqrt(2), 10 / np.sqrt(2)))
 
 
-def test_tilting_follows_its_parameters(rehearsal):
-    tilt = kind_of(rehearsal, "tilt")
+def test_tilting_follows_its_parameters():
+    tilt = kind_of("tilt")
     numbers = values_of(tilt, first_deg=-10.0, last_deg=24.0, depth_mm=1.0)
-    poses = tilt.poses(rehearsal.manipulator, numbers)
+    poses = tilt.poses(HAND, numbers)
     angles = np.degrees(np.arctan2(-poses[:, 1, 2], poses[:, 2, 2]))
     assert angles[[0, -1]] == pytest.approx([-10, 24], abs=1.5)
     assert faces_in(poses)[:, 2] == pytest.approx(R - 1.0, abs=FACET_MM)
-    ahead = tilt.poses(rehearsal.manipulator, numbers | dict(ahead=0.5))
+    ahead = tilt.poses(HAND, numbers | dict(ahead=0.5))
     assert faces_in(ahead)[0, 1] - faces_in(poses)[0, 1] == pytest.approx(0.5 * tilt.half_mm[1], abs=1.0)
 
 
@@ -253,8 +248,8 @@ def test_tilting_follows_its_parameters(rehearsal):
 
 
 @pytest.fixture(scope="module")
-def trial(rehearsal) -> SimpleNamespace:
-    return trial_of(rehearsal, coverage_of(16.0 * Z, 12.0).voxel_centres("tumour"))
+def trial() -> SimpleNamespace:
+    return trial_of(coverage_of(16.0 * Z, 12.0).voxel_centres("tumour"))
 
 
 def test_straight_sweeps_point_down_and_cover_the_target_side_by_side(trial):
@@ -278,19 +273,19 @@ def test_random_sweeps_depend_on_the_seed_and_are_over_the_target(trial):
     )
 
 
-def test_the_poses_of_a_plan_are_those_of_the_path_in_the_patient(rehearsal):
-    slide = kind_of(rehearsal, "slide")
+def test_the_poses_of_a_plan_are_those_of_the_path_in_the_patient():
+    slide, case = kind_of("slide"), case_of_ball()
     sides = [values_of(slide, start=-1.0, end=1.0, aside=aside) for aside in (-0.5, 0.5)]
-    path = [slide.poses(rehearsal.manipulator, values) for values in sides]
+    path = [slide.poses(HAND, values) for values in sides]
     poses = np.concatenate(path)
-    placed = np.stack([probe_in_patient(rehearsal, pose) for pose in poses])
+    placed = np.stack([case.probe_in_patient(pose) for pose in poses])
     # PLUS's axes of a probe: x to the marked side, y into the tissue, from the middle of the face.
     assert placed[:, :3, 3] == pytest.approx(faces_in(poses) + ORIGIN)
     assert placed[:, :3, 0] == pytest.approx(poses[:, :3, 0])
     assert placed[:, :3, 1] == pytest.approx(-poses[:, :3, 2])
     assert np.linalg.det(placed[:, :3, :3]) == pytest.approx(1)
     assert placed.tolist() == pytest.approx(np.array(in_patient(poses)))
-    again = planned(SimpleNamespace(rehearsal=rehearsal), sweep_of(*path))
+    again = planned(SimpleNamespace(case=case), sweep_of(*path))
     assert [len(each) for each in again] == [len(each) for each in path]
     assert np.concatenate(again) == pytest.approx(poses, abs=1e-9)
 

@@ -18,6 +18,7 @@ from plan_ball import (
     Y,
     Z,
     big_ball,
+    case_of_ball,
     faces_in,
     from_above,
     manipulator_on,
@@ -47,7 +48,7 @@ from rehearsal.planning.sweep_score import (
     why_better,
 )
 from rehearsal.planning.sweep_trial import Trial
-from scenes.scene import Trocar
+from scenes.scene import Scene, Trocar
 from ultrasound.probe_manipulator import ProbeManipulator, advanced, pose_at, poses_between, rigid
 
 
@@ -206,9 +207,9 @@ def test_incidence_is_the_mean_angle_to_the_surface(manipulator):
 
 def test_the_terms_of_a_path_are_those_of_its_poses(manipulator):
     """Over its limit of 5 mm in two of five poses, and restored in one of these and another; one of three holds is not possible."""
-    transducer = SimpleNamespace(compression_warning_mm=5.0)
-    rehearsal = SimpleNamespace(scene=SimpleNamespace(transducer=transducer), manipulator=manipulator)
-    trial = SimpleNamespace(rehearsal=rehearsal, held=lambda passes: np.array([True, False, True]))
+    case = case_of_ball(scene=Scene(anatomy={}, transducer=dict(compression_warning_mm=5.0)))
+    held = np.array([True, False, True])
+    trial = SimpleNamespace(case=case, manipulator=manipulator, held=lambda passes: held)
     top = pose_at(R * Z, -Z, X, SIZE[2])
     poses = np.stack([tilted(top, SIZE[2], angle) for angle in (-10.0, 20.0, 30.0, 0.0, 0.0)])
     compressions, contacts = [1.0, 5.0, 5.1, 9.0, 2.4], [0.2, 0.4, 0.9, 1.0, 0.5]

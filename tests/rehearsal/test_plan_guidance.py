@@ -1,14 +1,25 @@
 """Guidance along a plan: progress, the lines in the 3D view, and the keys."""
 
-from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from conftest import rotation_about
-from plan_ball import SIZE, over_ball, plan_of, straight_pass, sweep_of
-from rehearsal.sessions.session import MOST_UNDONE, History, Session
+from fake_organ import fake_timeline
+from plan_ball import SIZE, guide_over_ball, plan_of, straight_pass, sweep_of
 
+from rehearsal.loop.command import (
+    BeginAction,
+    Bookmark,
+    Command,
+    GoTo,
+    Move,
+    NewSession,
+    Pause,
+    Redo,
+    Reset,
+    Undo,
+)
 from rehearsal.planning.plan_guidance import ABOVE_MM, AHEAD, DEG_PER_MM_OFF, NEAR_MM, PlanGuidance
 from render import scene_view, transducer_shape
 from render.keys import Keys, begin
@@ -22,7 +33,7 @@ FIRST, SECOND = straight_pass(4, step_mm=2.0), straight_pass(3, 20.0, 2.0)
 
 
 def guide_of(*sweeps) -> PlanGuidance:
-    return PlanGuidance(over_ball(), plan_of(*(sweeps or [sweep_of(FIRST, SECOND)])))
+    return guide_over_ball(plan_of(*(sweeps or [sweep_of(FIRST, SECOND)])))
 
 
 def turned(pose: np.ndarray, degrees: float) -> np.ndarray:
@@ -40,13 +51,13 @@ def test_a_plan_followed_exactly_is_completed_without_deviation():
     for number, pose in enumerate([*FIRST, *SECOND]):
         assert guide.guidance().goal == pytest.approx(pose)
         assert guide.figures()["plan_followed"] == pytest.approx(number / 7)
-        guide.watch(pose)
+        guide.follow(pose)
     assert guide.figures() == pytest.approx(dict(plan_followed=1.0, plan_off_mm=0.0, plan_off_deg=0.0))
     assert guide.guidance().goal is None and guide.guidance().done.all()
     assert guide.in_words(0.5) == (
         "plan      two passes: 100 % completed, mean deviation 0.0 mm and 0 degrees; coverage of margin 50 % (planned 75 %)"
     )
-    guide.watch(SECOND[-1])
+    guide.follow(SECOND[-1])
     assert guide.figures()["plan_followed"] == 1.0
 
 
@@ -56,7 +67,7 @@ def test_the_deviation_is_the_distance_of_the_face_and_the_angle():
     for number, pose in enumerate(sparse):
         beside = turned(pose, 9.0 if number % 2 else 3.0)
         beside[:3, 3] += [0.6, 0.0, -0.8]
-        guide.watch(beside)
+        guide.follow(beside)
     figures = guide.figures()
     assert figures["plan_followed"] == 1.0 and figures["plan_off_mm"] == pytest.approx(1.0)
     assert figures["plan_off_deg"] == pytest.approx((4 * 3 + 3 * 9) / 7)
@@ -69,10 +80,10 @@ def test_each_pose_counts_at_its_least_distance_and_is_not_completed_before(offs
     guide = guide_of(sweep_of(straight_pass(11, step_mm=1.5)))
     (begin,) = straight_pass(1, offset)
     for height in np.arange(8.0, 1.0, -0.25):
-        guide.watch(advanced(begin, -height))
+        guide.follow(advanced(begin, -height))
         assert guide.next_pose == 0
     for number, pose in enumerate(straight_pass(101, offset, 0.15)):
-        guide.watch(pose)
+        guide.follow(pose)
         if offset == 0:
             assert guide.next_pose == min((number + 6) // 10 + 1, 11)
         elif number % 10 != 5:
@@ -85,7 +96,7 @@ def test_tilting_counts_each_pose_at_its_least_angle_too():
     tilted = np.stack([turned(straight_pass(1)[0], angle) for angle in np.arange(-30.0, 31.0, 2.0)])
     guide = guide_of(sweep_of(tilted))
     for angle in np.arange(-30.0, 30.1, 0.5):
-        guide.watch(turned(straight_pass(1)[0], angle))
+        guide.follow(turned(straight_pass(1)[0], angle))
         assert (angle + 30) / 2 < guide.next_pose <= (angle + 30) / 2 + 3
     assert guide.figures() == pytest.approx(
         dict(plan_followed=1.0, plan_off_mm=0.0, plan_off_deg=0.0), abs=1e-4
@@ -99,7 +110,7 @@ def test_the_path_is_drawn_on_each_pass_and_not_between_them():
     assert guide.guidance().path_mm == pytest.approx(np.array(segments) + [0, 0, ABOVE_MM])
     done = []
     for pose in [*FIRST, *SECOND]:
-        guide.watch(pose)
+        guide.follow(pose)
         done.append(guide.guidance().done.sum())
     assert done == [0, 1, 2, 3, 3, 4, 5]
 
@@ -107,12 +118,12 @@ def test_the_path_is_drawn_on_each_pass_and_not_between_them():
 def test_some_poses_may_be_skipped_and_progress_does_not_go_back():
     long = straight_pass(30, step_mm=5.0)
     guide = guide_of(sweep_of(long))
-    guide.watch(long[3])
+    guide.follow(long[3])
     assert guide.next_pose == 4 and guide.guidance().goal == pytest.approx(long[4])
-    guide.watch(long[0])
-    guide.watch(long[4 + AHEAD + 1])
+    guide.follow(long[0])
+    guide.follow(long[4 + AHEAD + 1])
     assert guide.next_pose == 4
-    guide.watch(long[4 + AHEAD - 1])
+    guide.follow(long[4 + AHEAD - 1])
     assert guide.next_pose == 4 + AHEAD
 
 
@@ -126,18 +137,18 @@ def test_a_pose_is_near_by_distance_and_angle_together(mm, degrees, near):
     guide = guide_of(sweep_of(sparse))
     beside = turned(sparse[2], degrees)
     beside[0, 3] += mm
-    guide.watch(beside)
+    guide.follow(beside)
     assert guide.next_pose == (2 if near else 0)
 
 
 def test_the_sweeps_are_shown_in_turn_and_then_none():
     guide = guide_of(sweep_of(FIRST), sweep_of(SECOND, name="tilting in one place", seen=0.6))
     assert guide.title() == "Plan 1: two passes, covers 75 %"
-    guide.watch(FIRST[0])
+    guide.follow(FIRST[0])
     assert guide.next_sweep() == "Plan 2: tilting in one place, covers 60 %"
     assert guide.next_pose == 0 and guide.guidance().goal == pytest.approx(SECOND[0])
     assert guide.next_sweep() == "Plan hidden"
-    guide.watch(FIRST[0])
+    guide.follow(FIRST[0])
     assert guide.guidance() is None and guide.figures() == {} and guide.in_words(0.5) == ""
     assert guide.next_sweep() == "Plan 1: two passes, covers 75 %" and len(guide.guidance().path_mm) == 3
 
@@ -146,7 +157,7 @@ def test_a_restart_clears_the_progress():
     guide = guide_of()
     assert guide.figures() == dict(plan_followed=0.0, plan_off_mm=None, plan_off_deg=None)
     assert guide.in_words(None) == "plan      two passes: 0 % completed"
-    guide.watch(FIRST[0])
+    guide.follow(FIRST[0])
     guide.restart()
     assert guide.next_pose == 0 and guide.figures()["plan_followed"] == 0 and not guide.guidance().done.any()
 
@@ -154,109 +165,80 @@ def test_a_restart_clears_the_progress():
 # Undo, reset and bookmarks
 
 
-class SessionOverBall:
-    """A session over the ball, in which each pose is an action, or the last one's sequel; its tissue is the pose."""
+class FollowedPlan:
+    """A guide that observes a timeline; the tissue is of no importance."""
 
     def __init__(self) -> None:
-        held = over_ball()
-        held.pose = held.settled = advanced(FIRST[0], -50.0)
-        held.snapshot = lambda manipulator=None: held.pose
-        held.restore = lambda pose: setattr(held, "pose", pose)
-        held.update_surfaces = lambda: None
-        self.rehearsal, self.session = held, Session(held)
-        self.session.record_state = lambda: None
-        self.history = History(self.session)
-        self.guide = PlanGuidance(held, plan_of(sweep_of(FIRST, SECOND), sweep_of(SECOND)))
+        self.timeline = fake_timeline()
+        self.timeline.apply(NewSession(pose=advanced(FIRST[0], -50.0)))
+        self.guide = guide_of(sweep_of(FIRST, SECOND), sweep_of(SECOND))
 
-    def step(self, pose: np.ndarray, acts: bool = True) -> None:
-        self.history.watch(acts, False)
-        self.rehearsal.pose = pose
-        self.session.end_step()
-        self.guide.go_with(self.session)
-
-    def act(self, *poses: np.ndarray) -> dict[str, float]:
-        """An action after a rest; the figures after it."""
-        for _ in range(11):
-            self.step(self.rehearsal.pose, acts=False)
-        for pose in poses:
-            self.step(pose)
+    def do(self, command: Command) -> dict[str, float | None]:
+        """The figures after a command."""
+        self.timeline.apply(command)
+        self.guide.observe(self.timeline.frame())
         return self.guide.figures()
 
-    def back(self, way: Callable[[], object]) -> dict[str, float]:
-        way()
-        self.guide.go_with(self.session)
-        return self.guide.figures()
+    def act(self, *poses: np.ndarray) -> dict[str, float | None]:
+        """The figures after an action."""
+        self.do(BeginAction())
+        return [self.do(Move(pose=pose)) for pose in poses][-1]
 
 
-@pytest.fixture
-def session_over_ball() -> SessionOverBall:
-    return SessionOverBall()
-
-
-def test_undo_and_redo_restore_the_progress(session_over_ball):
-    nothing = session_over_ball.guide.figures()
+def test_undo_and_redo_restore_the_progress():
+    followed = FollowedPlan()
     beside = turned(FIRST[1], 3.0)
     beside[0, 3] += 0.6
     steps = [
-        nothing,
-        session_over_ball.act(FIRST[0]),
-        session_over_ball.act(beside, FIRST[2]),
-        session_over_ball.act(FIRST[3], SECOND[0]),
+        followed.guide.figures(),
+        followed.act(FIRST[0]),
+        followed.act(beside, FIRST[2]),
+        followed.act(FIRST[3], SECOND[0]),
     ]
     assert [each["plan_followed"] for each in steps] == pytest.approx([0, 1 / 7, 3 / 7, 5 / 7])
     assert steps[2]["plan_off_mm"] == pytest.approx(0.2) and steps[2]["plan_off_deg"] == pytest.approx(1.0)
     for before in steps[2::-1]:
-        assert session_over_ball.back(session_over_ball.history.undo) == before
-    assert session_over_ball.guide.guidance().goal == pytest.approx(FIRST[0])
+        assert followed.do(Undo()) == before
+    assert followed.guide.guidance().goal == pytest.approx(FIRST[0])
     for after in steps[1:]:
-        assert session_over_ball.back(session_over_ball.history.redo) == after
+        assert followed.do(Redo()) == after
     # Another way from there on leaves what is kept of the one before as it was.
-    session_over_ball.back(session_over_ball.history.undo)
-    assert (
-        session_over_ball.act(FIRST[3])["plan_off_mm"] == pytest.approx(0.15)
-        and session_over_ball.back(session_over_ball.history.undo) == steps[2]
-    )
+    followed.do(Undo())
+    assert followed.act(FIRST[3])["plan_off_mm"] == pytest.approx(0.15)
+    assert followed.do(Undo()) == steps[2]
 
 
-def test_reset_and_bookmarks_restore_the_progress(session_over_ball):
-    nothing, beside = session_over_ball.guide.figures(), FIRST[0].copy()
+def test_reset_and_bookmarks_restore_the_progress():
+    followed, beside = FollowedPlan(), FIRST[0].copy()
+    nothing = followed.do(Pause())
     beside[0, 3] += 0.6
-    marked = session_over_ball.act(beside, FIRST[1])
-    session_over_ball.history.set_bookmark()
-    after = session_over_ball.act(FIRST[2])
-    assert session_over_ball.back(session_over_ball.history.reset) == nothing
-    assert session_over_ball.back(session_over_ball.history.undo) == after
+    marked = followed.act(beside, FIRST[1])
+    followed.do(Bookmark())
+    bookmark = GoTo(state=followed.timeline.number)
+    after = followed.act(FIRST[2])
+    assert followed.do(Reset()) == nothing
+    assert followed.do(Undo()) == after
     # Gone to twice, with a better way from there in between.
     for _ in range(2):
-        assert session_over_ball.back(session_over_ball.history.to_bookmark) == marked
-        better = session_over_ball.act(FIRST[0], FIRST[2])
-        assert (
-            better["plan_followed"] == after["plan_followed"]
-            and better["plan_off_mm"] == 0 < marked["plan_off_mm"]
-        )
-    assert session_over_ball.back(session_over_ball.history.undo) == marked
+        assert followed.do(bookmark) == marked
+        better = followed.act(FIRST[0], FIRST[2])
+        assert better["plan_followed"] == after["plan_followed"]
+        assert better["plan_off_mm"] == 0 < marked["plan_off_mm"]
+    assert followed.do(Undo()) == marked
 
 
-def test_another_sweep_has_no_progress_at_steps_before_it_was_shown(session_over_ball):
-    session_over_ball.act(FIRST[0], FIRST[1])
-    session_over_ball.act(FIRST[2])
-    session_over_ball.guide.next_sweep()
-    assert session_over_ball.guide.figures()["plan_followed"] == 0
-    assert session_over_ball.act(SECOND[0])["plan_followed"] == pytest.approx(1 / 3)
+def test_another_sweep_has_no_progress_at_states_before_it_was_shown():
+    followed = FollowedPlan()
+    followed.act(FIRST[0], FIRST[1])
+    followed.act(FIRST[2])
+    followed.guide.next_sweep()
+    assert followed.guide.figures()["plan_followed"] == 0
+    assert followed.act(SECOND[0])["plan_followed"] == pytest.approx(1 / 3)
     for _ in range(2):
-        assert session_over_ball.back(session_over_ball.history.undo)["plan_followed"] == 0
+        assert followed.do(Undo())["plan_followed"] == 0
     # Nor where it is shown and undone in one frame.
-    session_over_ball.guide.next_sweep()
-    assert session_over_ball.back(session_over_ball.history.redo) == {}
-
-
-def test_the_history_is_as_long_as_that_of_the_session(session_over_ball):
-    for number in range(MOST_UNDONE + 9):
-        session_over_ball.act(FIRST[number % 4])
-    assert (
-        session_over_ball.guide._history.keys() == session_over_ball.session.kept_states.keys()
-        and len(session_over_ball.guide._history) <= MOST_UNDONE + 1
-    )
+    followed.guide.next_sweep()
+    assert followed.do(Redo()) == {}
 
 
 # Its lines
@@ -293,14 +275,14 @@ def test_the_completed_part_of_the_path_has_another_colour(one_device):
     guide, lines = guide_of(), PlanLines(EDGES)
     for pose in [None, *FIRST[:3]]:
         if pose is not None:
-            guide.watch(pose)
+            guide.follow(pose)
         guidance = guide.guidance()
         segments, colours, (goal,) = drawn(lines, guidance)
         assert segments == pytest.approx(guidance.path_mm)
         assert np.array_equal(colours, np.where(guidance.done[:, None], DONE, TO_GO))
         assert goal[0] == pytest.approx(transducer_shape.placed(EDGES, guidance.goal), abs=1e-5)
     for pose in [FIRST[3], *SECOND]:
-        guide.watch(pose)
+        guide.follow(pose)
     _, colours, more = drawn(lines, guide.guidance())
     assert (colours == DONE).all() and more == []
 

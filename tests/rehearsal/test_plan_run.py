@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from rehearsal.planning.plan_file import Plan, read_plan
 from rehearsal.planning.sweep_path import frame_towards, sliding
 from rehearsal.planning.sweep_score import MEANS, ScoreTerms
 from rehearsal.planning.sweep_trial import Trial
+from scenes.scene import with_options
 from studies.planning.baseline_sweeps import planned
 from ultrasound.probe_manipulator import advanced, indentation
 from version import VERSION
@@ -97,7 +98,7 @@ def test_the_score_terms_of_a_plan_are_those_of_its_sweep_tried_again(made):
     terms = vars(made.trial.run(planned(made.trial, sweep), made.plan.speed_mm_s))
     # Not one step more or less, but on the way from one pass to the next, which depends on the last digits.
     steps = len(sweep.passes) - 1 + 1e-3
-    step_s = made.trial.rehearsal.settings.time_step_s
+    step_s = made.trial.case.scene.solver.time_step_s
     assert terms.pop("time_s") == pytest.approx(sweep.parts["time_s"], abs=steps * step_s)
     assert terms == pytest.approx({name: sweep.parts[name] for name in terms}, abs=1e-2)
     assert sweep.parts["reachable"] == 1.0 and sweep.parts["seen"] > 0
@@ -118,7 +119,7 @@ def path_at(trial: Trial, depth_mm: float, passes: int = 1) -> list[np.ndarray]:
     """Over the tumour, along y."""
     frame = frame_towards(np.array([0.0, 4.0, 0.0]), np.array([0.0, 0, 1]), np.array([1.0, 0, 0]))
     aside = np.linspace(-3.0, 3.0, passes) if passes > 1 else np.zeros(1)
-    return sliding(trial.rehearsal.manipulator, frame, aside, -5.0, 5.0, depth_mm, 0.5)
+    return sliding(trial.manipulator, frame, aside, -5.0, 5.0, depth_mm, 0.5)
 
 
 @pytest.fixture
@@ -132,8 +133,8 @@ def run(trial: Trial, path: list[np.ndarray], speed_mm_s: float = SPEED_MM_S) ->
 
 @pytest.mark.parametrize("count", [1, 3, 40])
 def test_a_whole_number_of_steps_stays_one_where_poses_were_rounded(trial, count):
-    start, end = trial.rehearsal.manipulator.home, trial.rehearsal.manipulator.home.copy()
-    step_mm = SPEED_MM_S * trial.rehearsal.settings.time_step_s
+    start, end = trial.manipulator.home, trial.manipulator.home.copy()
+    step_mm = SPEED_MM_S * trial.case.scene.solver.time_step_s
     for off_mm, steps in ((-1e-6, count), (0.0, count), (1e-6, count), (0.01 * step_mm, count + 1)):
         end[:3, 3] = start[:3, 3] + [0.0, 0.0, count * step_mm + off_mm]
         assert trial._steps(start, end, SPEED_MM_S) == steps
@@ -158,18 +159,16 @@ def test_a_pass_tried_alone_has_the_terms_of_a_sweep_of_it(trial):
     assert np.array_equal(again.seen, alone.seen) and np.array_equal(again.sums, alone.sums)
 
 
-def test_a_deeper_path_has_more_compression_and_contact(trial):
+def test_a_deeper_path_has_more_compression_and_contact(trial, monkeypatch):
     shallow, middle, deep = (run(trial, path_at(trial, depth)) for depth in (0.5, 3.0, 6.0))
     for name in ("compression_mean_mm", "compression_max_mm"):
         assert getattr(shallow, name) < getattr(middle, name) < getattr(deep, name)
     # Under the face the tissue gives way by what it is pressed deeper, but for what goes aside and down.
     assert deep.compression_mean_mm - shallow.compression_mean_mm == pytest.approx(5.5, rel=0.3)
     assert shallow.contact <= deep.contact
-    scene = trial.rehearsal.scene
-    limit = scene.transducer.model_copy(update=dict(compression_warning_mm=middle.compression_mean_mm))
-    trial.rehearsal.scene = scene.model_copy(update=dict(transducer=limit))
+    limit = {"transducer.compression_warning_mm": middle.compression_mean_mm}
+    monkeypatch.setattr(trial, "case", replace(trial.case, scene=with_options(trial.case.scene, limit)))
     assert [run(trial, path_at(trial, depth)).over_limit for depth in (0.5, 6.0)] == [0.0, 1.0]
-    trial.rehearsal.scene = scene
 
 
 def test_a_lifted_path_has_no_coverage_and_no_compression(trial):
@@ -189,19 +188,18 @@ def test_a_path_that_starts_in_the_organ_cannot_be_reached(trial, monkeypatch):
     assert trial.terms(deep, [0.0], [1.0]).reachable < 1.0
 
 
-def test_two_passes_cover_more_than_either_and_the_probe_is_lifted_between(trial):
+def test_two_passes_cover_more_than_either_and_the_probe_is_lifted_between(trial, monkeypatch):
     both = path_at(trial, 2.0, 2)
     depths: list[float] = []
-    rehearsal, advance = trial.rehearsal, trial.rehearsal.advance
+    advance = trial.rehearsal.advance
 
-    def watched(pose: np.ndarray) -> None:
-        depths.append(indentation(pose, rehearsal.size_mm, rehearsal.manipulator.samples, 0.0))
+    def noted(pose: np.ndarray) -> None:
+        depths.append(indentation(pose, trial.case.size_mm, trial.manipulator.samples, 0.0))
         advance(pose)
 
     one, other = (run(trial, [each]) for each in both)
-    rehearsal.advance = watched
+    monkeypatch.setattr(trial.rehearsal, "advance", noted)
     together = run(trial, both)
-    del rehearsal.advance
     assert max(one.seen, other.seen) < together.seen
     # From above, along a pass, up, over, down, along the other: never deeper than the passes, and up in between.
     # The first step ends 3 mm above.
@@ -209,7 +207,7 @@ def test_two_passes_cover_more_than_either_and_the_probe_is_lifted_between(trial
     middle = depths[len(depths) // 3 : 2 * len(depths) // 3]
     assert min(middle) < -3.0
     assert together.path_mm > one.path_mm + other.path_mm
-    assert together.time_s == pytest.approx(len(depths) * rehearsal.settings.time_step_s)
+    assert together.time_s == pytest.approx(len(depths) * trial.case.scene.solver.time_step_s)
 
 
 def test_a_slower_sweep_takes_longer_on_the_same_path(trial):
@@ -221,17 +219,15 @@ def test_a_slower_sweep_takes_longer_on_the_same_path(trial):
     assert 20.0 * slow.time_s == pytest.approx(slow.path_mm, rel=0.15)
 
 
-def test_a_restored_state_counts_as_over_the_limit_at_its_pose(trial):
-    path, rehearsal = path_at(trial, 2.0), trial.rehearsal
-    advance = rehearsal.advance
+def test_a_restored_state_counts_as_over_the_limit_at_its_pose(trial, monkeypatch):
+    path, advance = path_at(trial, 2.0), trial.rehearsal.advance
 
     def troubled(pose: np.ndarray) -> None:
         advance(pose)
-        rehearsal.notice = "state restored" if np.allclose(pose, path[0][3]) else ""
+        trial.rehearsal.organ.notice = "state restored" if np.allclose(pose, path[0][3]) else ""
 
-    rehearsal.advance = troubled
+    monkeypatch.setattr(trial.rehearsal, "advance", troubled)
     terms = run(trial, path)
-    del rehearsal.advance
     assert terms.over_limit == pytest.approx(1 / len(np.concatenate(path)))
 
 

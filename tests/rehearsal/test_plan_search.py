@@ -185,12 +185,11 @@ def test_the_surrogate_tries_rows_and_random_passes_and_varies_the_best(monkeypa
 @pytest.mark.usefixtures("one_device")
 def test_passes_are_in_the_order_of_their_ends():
     manipulator = manipulator_on(big_ball())
-    rehearsal = SimpleNamespace(manipulator=manipulator)
     one = kind("one")
     values = dict.fromkeys(RANGES["slide"], 0.0) | dict(start=-1.0, end=1.0)
     aside = [one.scaled(values | dict(aside=at)) for at in (-1.0, 1.0, 0.0)]
     backwards = [one.scaled(values | dict(aside=0.5, start=1.0, end=-1.0))]
-    ordered = plan_search._in_order(SimpleNamespace(rehearsal=rehearsal), one, aside + backwards)
+    ordered = plan_search._in_order(SimpleNamespace(manipulator=manipulator), one, aside + backwards)
     # From -10 mm to the end of the one that runs back at 5 mm, then from where that ends to the nearest.
     assert [round(float(each[0, 0, 3])) for each in ordered] == [-10, 5, 0, 10]
 
@@ -313,9 +312,7 @@ def test_a_tumour_target_needs_a_tumour(target):
 @pytest.mark.parametrize(("target", "margin"), [("tumour", 5.0), ("margin", 0.0)])
 def test_a_target_without_a_voxel_is_refused(monkeypatch, target, margin):
     speck = trimesh.creation.icosphere(subdivisions=1, radius=0.3).apply_translation([0.7, 0.7, 0.7])
-    built = SimpleNamespace(
-        whole_organ=big_ball(), whole_tumour=speck, manipulator=manipulator_on(big_ball()), origin=np.zeros(3)
-    )
+    built = SimpleNamespace(manipulator=manipulator_on(big_ball()))
     monkeypatch.setattr("rehearsal.planning.sweep_trial.Rehearsal", lambda *_: built)
     anatomy = replace(problem_of().anatomy, tumour=speck)
     # Not in a process of its own, which would build a rehearsal.

@@ -7,8 +7,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from plan_ball import over_ball, plan_of, straight_pass, sweep_of
-from rehearsal.open_window import probe_with_settings
+import trimesh
+from plan_ball import (
+    big_ball,
+    case_of_ball,
+    guide_over_ball,
+    manipulator_on,
+    plan_of,
+    straight_pass,
+    sweep_of,
+)
 
 from rehearsal.notices import Notices
 from rehearsal.planning import plans_in_window
@@ -16,9 +24,10 @@ from rehearsal.planning.plan_file import PlanError, read_plan
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plan_search import total_work
 from rehearsal.planning.plans_in_window import SPEED_MM_S, TRIALS, PlanControl, minutes_in_words
+from rehearsal.settings import probe_with_settings
 from rehearsal.worker_processes import WorkerError
 from render.viewer import Controls, Settings
-from scenes.scene import Scene
+from scenes.anatomy import LoadedAnatomy
 from ultrasound.probe import load_probe
 
 LONGEST_S = 10.0
@@ -77,17 +86,22 @@ def searching(monkeypatch) -> SteppedSearch:
     return SteppedSearch(monkeypatch)
 
 
+def plans_for(tumour, out) -> PlanControl:
+    """The control of a rehearsal that follows no plan."""
+    followed = SimpleNamespace(guide=None, manipulator=manipulator_on(big_ball()))
+    followed.follow = lambda guide: setattr(followed, "guide", guide)
+    case = case_of_ball(probe=PROBE, tumour=tumour)
+    return PlanControl(case, LoadedAnatomy(case.organ, tumour, None, ()), followed, out, Notices())
+
+
 @pytest.fixture
 def plans(tmp_path) -> PlanControl:
-    held = SimpleNamespace(**vars(over_ball()), tumour="a tumour", scene=Scene(anatomy={}), probe=PROBE)
-    followed = SimpleNamespace(guide=None)
-    followed.follow = lambda guide: setattr(followed, "guide", guide)
-    return PlanControl(held, SimpleNamespace(tumour=held.tumour), followed, tmp_path, Notices())
+    return plans_for(trimesh.creation.icosphere(radius=7.0), tmp_path)
 
 
 def message(plans: PlanControl, **controls) -> str:
     settings = controls.pop("settings", None) or Settings()
-    plans.watch(Controls(settings, **controls))
+    plans.control(Controls(settings, **controls))
     return "".join(plans.notices.present())
 
 
@@ -171,7 +185,7 @@ def test_the_key_stops_a_search_and_otherwise_shows_the_next_sweep(
                 yield each
 
         monkeypatch.setattr(plans_in_window, "Workers", late)
-    plans.measurements.guide = guide = PlanGuidance(plans.rehearsal, plan_of(sweep_of(straight_pass(3))))
+    plans.measurements.guide = guide = guide_over_ball(plan_of(sweep_of(straight_pass(3))))
     message(plans, plan=True)
     search = plans._job
     if began:
@@ -224,16 +238,13 @@ def test_one_processor_is_left_to_the_rehearsal(monkeypatch, searching, plans, p
     assert searching.jobs == [jobs]
 
 
-def test_the_target_is_shown_and_without_a_tumour_it_is_the_organ(searching, plans):
+def test_the_target_is_shown_and_without_a_tumour_it_is_the_organ(searching, plans, tmp_path):
     settings = Settings()
     for target, words in (("tumour", "the tumour"), ("organ", "the whole kidney")):
         settings.plan_for = target
         assert message(plans, settings=settings) == f"A plan for {words}: {{plan}}"
         assert message(plans, settings=settings) == ""
-    settings.plan_for = "tumour"
-    message(plans, settings=settings)
-    plans.rehearsal.tumour = None
-    settings.plan_for = "margin"
+    plans, settings.plan_for = plans_for(None, tmp_path), "tumour"
     assert message(plans, settings=settings) == "No tumour here. A plan for the whole kidney: {plan}"
     assert message(plans, settings=settings, plan=True) == "Planning for the whole kidney"
     searching.run_trials(4)
@@ -244,10 +255,10 @@ def test_the_target_is_shown_and_without_a_tumour_it_is_the_organ(searching, pla
 def test_sweeps_are_shown_in_turn(plans):
     assert message(plans, next_plan=True) == "No plan: {plan} makes one"
     first, second = straight_pass(3), straight_pass(2)
-    plans.measurements.guide = guide = PlanGuidance(
-        plans.rehearsal, plan_of(sweep_of(first), sweep_of(second, name="b", seen=0.5))
+    plans.measurements.guide = guide = guide_over_ball(
+        plan_of(sweep_of(first), sweep_of(second, name="b", seen=0.5))
     )
-    guide.watch(first[0])
+    guide.follow(first[0])
     assert guide.next_pose == 1 and np.array_equal(guide.guidance().done, [False, False])
     assert message(plans, next_plan=True) == "Plan 2: b, covers 50 %"
     assert message(plans, next_plan=True) == "Plan hidden"

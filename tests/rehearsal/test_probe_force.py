@@ -5,13 +5,16 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from rehearsal.sessions.session import Session
 from small_bead_case import briefly, small_anatomy
 
+from rehearsal.case import case_of
+from rehearsal.loop.command import Move
+from rehearsal.loop.frame import Step
+from rehearsal.notices import Notices
 from rehearsal.pressed_organ import PressedOrgan
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.packed_arrays import unpack_wrenches
-from rehearsal.sessions.recorder import record
+from rehearsal.sessions.recorder import SessionRecorder, header_of
 from scenes.scene import with_options
 from ultrasound.probe_manipulator import array_face_centre
 
@@ -20,42 +23,44 @@ pytestmark = pytest.mark.usefixtures("arrays_stored")
 
 @pytest.fixture(scope="module")
 def built(one_device) -> Rehearsal:
-    return Rehearsal(with_options(briefly(60), {"tissue.cell_mm": 4.0}), small_anatomy())
+    anatomy = small_anatomy()
+    return Rehearsal(case_of(with_options(briefly(60), {"tissue.cell_mm": 4.0}), anatomy), anatomy)
 
 
 @pytest.fixture
 def rehearsal(built) -> Iterator[Rehearsal]:
     built.reset()
     yield built
-    built.on_wrench = None
+    built.organ.on_wrench = None
 
 
-def pressed(rehearsal: Rehearsal, depth_mm: float, steps: int = 40) -> list:
+def pressed(rehearsal: Rehearsal, depth_mm: float, steps: int = 40) -> list[Step]:
     """The steps in which the probe moves to a depth."""
-    return [rehearsal.timed_step(rehearsal.pose_at_depth(depth_mm * n / steps)) for n in range(1, steps + 1)]
+    depths = depth_mm * np.arange(1, steps + 1) / steps
+    return rehearsal.do(*(Move(pose=rehearsal.pose_at_depth(depth)) for depth in depths)).steps
 
 
 def test_the_tissue_pushes_the_probe_back_along_its_axis(rehearsal):
     steps = pressed(rehearsal, 3.0)
     force = np.array([step.wrench[:3] for step in steps])
-    out = rehearsal.pose[:3, 2]
+    pose, height = rehearsal.frame.pose, rehearsal.case.size_mm[2]
+    out = pose[:3, 2]
     assert force[-1] @ out > 0.1 and (np.diff(force[15::6] @ out) > 0).all()
     assert np.linalg.norm(force[-1] - (force[-1] @ out) * out) < 0.3 * force[-1] @ out
-    assert (rehearsal.wrench() == steps[-1].wrench).all()
+    assert (rehearsal.frame.wrench == steps[-1].wrench).all()
     # About the centre of the array face: the press is central, so that the lever is short.
     assert np.linalg.norm(steps[-1].wrench[3:]) < 3.0 * np.linalg.norm(force[-1])
-    face = array_face_centre(rehearsal.pose, rehearsal.size_mm[2])
-    assert np.linalg.norm(face - rehearsal.pose[:3, 3]) == pytest.approx(rehearsal.size_mm[2] / 2)
+    assert np.linalg.norm(array_face_centre(pose, height) - pose[:3, 3]) == pytest.approx(height / 2)
 
 
 def test_without_contact_there_is_no_force(rehearsal):
-    step = rehearsal.timed_step(rehearsal.pose_at_depth(-20.0))
+    (step,) = pressed(rehearsal, -20.0, 1)
     assert (step.wrench == 0).all()
 
 
 def test_a_haptic_device_is_called_after_each_step(rehearsal):
     called: list[tuple[np.ndarray, np.ndarray]] = []
-    rehearsal.on_wrench = lambda pose, wrench: called.append((pose, wrench))
+    rehearsal.organ.on_wrench = lambda pose, wrench: called.append((pose, wrench))
     steps = pressed(rehearsal, 2.0, 10)
     assert len(called) == 10
     for (pose, wrench), step in zip(called, steps, strict=True):
@@ -64,18 +69,16 @@ def test_a_haptic_device_is_called_after_each_step(rehearsal):
 
 def test_a_model_whose_contacts_have_no_forces_has_no_wrench(one_device):
     scene = with_options(briefly(5), {"tissue.radius_mm": 3.3})
-    organ = PressedOrgan(scene, small_anatomy())
+    organ = PressedOrgan(case_of(scene, small_anatomy()))
     organ.on_wrench = lambda *_: pytest.fail("called without a force")
-    assert organ.timed_step(organ.pose).wrench is None
+    assert organ.timed_step(organ.pose)[1] is None
 
 
 def test_the_sessions_file_has_the_force_of_every_step(rehearsal, tmp_path):
-    session = Session(rehearsal)
-    recorder = record(session, small_anatomy(), "cpu", tmp_path)
+    header = header_of(rehearsal.case, small_anatomy(), "cpu", True, 1 / 60, None)
+    recorder = SessionRecorder(tmp_path / "session", header, Notices())
     steps = pressed(rehearsal, 3.0, 90)
-    for step in steps:
-        session.end_step(step.pose, step.length_s, step.wrench)
-        recorder.keep_up()
+    recorder.observe(rehearsal.frame)
     recorder.close({})
     lines = [json.loads(line) for line in recorder.path.read_text("utf-8").splitlines()]
     found = np.concatenate([unpack_wrenches(line["wrenches"]) for line in lines if "wrenches" in line])

@@ -8,12 +8,12 @@ import pytest
 import SimpleITK as sitk
 import trimesh
 from coarse_patient import thinned
-from rehearsal.frame import image_view
-from rehearsal.open_window import initial_settings
 from slicing import hounsfield, organ_mask
 
-from rehearsal.measurements.run_report import Tally
-from rehearsal.rehearsal import Rehearsal
+from rehearsal.case import case_of
+from rehearsal.imaging import image_view
+from rehearsal.rehearsal import Rehearsal, script_length_s
+from rehearsal.settings import initial_settings
 from scenes.anatomy import load_anatomy
 from scenes.patients.patient_folder import save_patient
 from scenes.patients.patient_import import import_patient
@@ -25,9 +25,7 @@ from scenes.scene import PAPER, Press, Scene, load_scene, with_options
 from scenes.volumes.lazy_volume import LazyVolume
 from sim.fields import array_of
 from sim.signed_distance import signed_distance
-from sim.skinning import Skin
 from ultrasound.persistence import Persistence
-from ultrasound.probe_manipulator import image_plane
 from ultrasound.scanner import B_MODE
 
 pytestmark = pytest.mark.usefixtures("arrays_stored")
@@ -57,10 +55,31 @@ def real_patient(data: Path, tmp_path: Path) -> tuple[Scene, Path]:
     return with_options(patient_scene(patient), {"tissue.cell_mm": 6.0}), tmp_path / "patient"
 
 
-def pressed_phantom() -> Rehearsal:
+@pytest.fixture(scope="module")
+def built(one_device) -> Rehearsal:
     scene, folder = phantom()
     whole = load_anatomy(scene, folder)
-    return Rehearsal(scene, replace(whole, ct=thinned(whole.ct), labels=thinned(whole.labels)))
+    anatomy = replace(whole, ct=thinned(whole.ct), labels=thinned(whole.labels))
+    return Rehearsal(case_of(scene, anatomy), anatomy)
+
+
+@pytest.fixture
+def rehearsal(built) -> Rehearsal:
+    built.reset()
+    return built
+
+
+def press(rehearsal: Rehearsal) -> None:
+    """The scripted press, in 31 steps."""
+    for step in range(31):
+        rehearsal.advance(rehearsal.scripted_pose(step / 30 * script_length_s(rehearsal.case)))
+    rehearsal.show()
+
+
+def images(rehearsal: Rehearsal, look=LOOK) -> dict[str, np.ndarray]:
+    """Of the frame that is shown."""
+    anatomy = rehearsal.anatomy
+    return anatomy.scanner.images(anatomy.image_plane(), rehearsal.case.probe, *look).by_name
 
 
 def resampled(folder: Path, plane, origin: np.ndarray, pixels: int) -> np.ndarray:
@@ -77,14 +96,17 @@ def resampled(folder: Path, plane, origin: np.ndarray, pixels: int) -> np.ndarra
 
 def assert_at_rest_the_slice_is_the_ct(scene: Scene, folder: Path) -> None:
     scene = scene.model_copy(update={"press": Press(warm_up_steps=0)})
-    rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
+    loaded = load_anatomy(scene, folder)
+    rehearsal = Rehearsal(case_of(scene, loaded), loaded)
+    anatomy = rehearsal.anatomy
     rehearsal.manipulator.turn(20, 10, 35)
-    rehearsal.pose = rehearsal.manipulator.pose()
-    rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK_AT_CT)
-    plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
-    cut = rehearsal.scanner.ct_slice
+    rehearsal.organ.pose = rehearsal.manipulator.pose()
+    rehearsal.show()
+    images(rehearsal, LOOK_AT_CT)
+    cut, pixels = anatomy.scanner.ct_slice, scene.image.pixels
     inside = organ_mask(cut)
-    difference = np.abs(hounsfield(cut) - resampled(folder, plane, rehearsal.origin, scene.image.pixels))
+    there = resampled(folder, anatomy.image_plane(), rehearsal.case.origin, pixels)
+    difference = np.abs(hounsfield(cut) - there)
     print(f"mean {difference[inside].mean():.4f} HU, maximum {difference[inside].max():.3f} HU")
     assert inside.mean() > 0.1
     # The bar is 5 HU; float32 positions (1e-5 mm) in gradients of 500 HU/mm leave far less.
@@ -99,75 +121,67 @@ def test_at_rest_the_slice_is_a_real_ct_however_its_voxels_lie(one_device, data,
     assert_at_rest_the_slice_is_the_ct(*real_patient(data, tmp_path))
 
 
-def test_pressing_moves_the_tissue_and_the_slice_follows(kept):
-    rehearsal = kept(pressed_phantom)
-    before = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK).by_name
-    top = array_of(rehearsal.organ_skin.vertices)
-    for step in range(31):
-        rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
-    rehearsal.update_surfaces()
-    moved = array_of(rehearsal.organ_skin.vertices) - top
+def test_pressing_moves_the_tissue_and_the_slice_follows(rehearsal):
+    anatomy, before, top = rehearsal.anatomy, images(rehearsal), rehearsal.anatomy.vertices
+    press(rehearsal)
     assert rehearsal.indentation_mm() == pytest.approx(12.38)
-    assert (moved @ rehearsal.gravity_direction).max() > 6.0
-    pressed = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK).by_name
+    assert ((anatomy.vertices - top) @ rehearsal.case.gravity_direction).max() > 6.0
+    pressed = images(rehearsal)
     assert list(pressed) == ["B-mode", "CT"]
     assert all(np.abs(pressed[name].astype(int) - before[name]).mean() > 10 for name in before)
-    assert 0.97 < rehearsal.volume_ratio() < 1.0
-    assert rehearsal.contacts.measure_penetration() <= 0.5
+    assert 0.97 < anatomy.volume_ratio() < 1.0
+    assert rehearsal.organ.contacts.measure_penetration() <= 0.5
     rehearsal.reset()
-    rehearsal.update_surfaces()
-    after = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK).by_name
+    after = images(rehearsal)
     assert all(np.array_equal(after[name], before[name]) for name in before)
     assert rehearsal.indentation_mm() == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_pixel_shows_the_tissue_that_is_there_now(kept):
-    rehearsal = kept(pressed_phantom)
-    for step in range(31):
-        rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
-    rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK_AT_CT)
-    plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
-    pixels = np.argwhere(organ_mask(rehearsal.scanner.ct_slice))[::1009]
-    spacing = np.array([plane.width_mm, plane.depth_mm]) / rehearsal.scene.image.pixels
+def test_a_pixel_shows_the_tissue_that_is_there_now(rehearsal):
+    press(rehearsal)
+    images(rehearsal, LOOK_AT_CT)
+    anatomy, count = rehearsal.anatomy, rehearsal.case.scene.image.pixels
+    plane = anatomy.image_plane()
+    pixels = np.argwhere(organ_mask(anatomy.scanner.ct_slice))[::1009]
+    spacing = np.array([plane.width_mm, plane.depth_mm]) / count
     local = (pixels[:, ::-1] + 0.5) * spacing - [plane.width_mm / 2, 0]
     shown_at = np.column_stack([local, np.zeros(len(local)), np.ones(len(local))]) @ plane.world_from_plane.T
-    rest = rehearsal.scanner.plane.rest_grid(rehearsal.scene.image.pixels)[pixels[:, 0], pixels[:, 1]]
-    carried = array_of(Skin(rehearsal.model.carrier, rest).vertices)
-    off = np.linalg.norm(carried - shown_at[:, :3], axis=1)
+    rest = anatomy.scanner.plane.rest_grid(count)[pixels[:, 0], pixels[:, 1]]
+    off = np.linalg.norm(array_of(anatomy.skin(rest).vertices) - shown_at[:, :3], axis=1)
     unmoved = np.linalg.norm(rest - shown_at[:, :3], axis=1)
     assert len(off) > 50 and unmoved.mean() > 2.0
     # Cells of 8 mm are straight where the clusters bend: under a tenth of the motion on average.
     assert off.mean() < 0.1 * unmoved.mean()
 
 
-def test_a_hand_cannot_outrun_its_speed(kept):
-    rehearsal = kept(pressed_phantom)
-    away = rehearsal.pose.copy()
+def test_a_hand_cannot_outrun_its_speed(rehearsal):
+    away = rehearsal.frame.pose.copy()
     away[:3, 3] += [0, -100.0, 0]
-    moved = rehearsal.pose_towards(away)
+    moved = rehearsal.manipulator.pose_towards(away, rehearsal.frame.pose, 1 / 60)
     assert np.linalg.norm(moved[:3, 3] - away[:3, 3]) == pytest.approx(100.0 - 150.0 / 60)
 
 
-def test_the_transducer_goes_over_the_organ_not_through_it(kept):
-    rehearsal = kept(pressed_phantom)
-    manipulator, middle = rehearsal.manipulator, rehearsal.manipulator.vertices.mean(axis=0)
-    ends = [
-        middle + side * 30 * np.array(rehearsal.press.lateral) - 60 * rehearsal.gravity_direction
-        for side in (-1, 1)
-    ]
-    manipulator.point(ends[0], rehearsal.gravity_direction)
-    for _ in range(90):
-        rehearsal.advance(rehearsal.pose_towards(manipulator.pose()))
-    there = rehearsal.pose.copy()
-    manipulator.point(ends[1], rehearsal.gravity_direction)
-    deepest = -np.inf
-    for _ in range(90):
-        rehearsal.advance(rehearsal.pose_towards(manipulator.pose()))
-        deepest = max(deepest, rehearsal.indentation_mm())
-    assert np.linalg.norm(rehearsal.pose[:3, 3] - there[:3, 3]) > 30
-    assert rehearsal.pose == pytest.approx(manipulator.pose(), abs=1e-6)
+def test_the_transducer_goes_over_the_organ_not_through_it(rehearsal):
+    manipulator, down = rehearsal.manipulator, rehearsal.case.gravity_direction
+    across = 30 * np.array(rehearsal.case.press.lateral)
+    ends = [manipulator.vertices.mean(axis=0) + side * across - 60 * down for side in (-1, 1)]
+
+    def deepest(end: np.ndarray) -> float:
+        """On the way to a place above the organ [mm]."""
+        manipulator.point(end, down)
+        depths = []
+        for _ in range(90):
+            goal = manipulator.pose_towards(manipulator.pose(), rehearsal.organ.pose, 1 / 60)
+            rehearsal.advance(goal)
+            depths.append(rehearsal.indentation_mm())
+        return max(depths)
+
+    deepest(ends[0])
+    there = rehearsal.organ.pose.copy()
     # A straight way would cut several millimetres deep into the organ's curve.
-    assert deepest < 0.5
+    assert deepest(ends[1]) < 0.5
+    assert np.linalg.norm(rehearsal.organ.pose[:3, 3] - there[:3, 3]) > 30
+    assert rehearsal.organ.pose == pytest.approx(manipulator.pose(), abs=1e-6)
 
 
 def test_every_feature_at_once_without_a_ct_stays_finite_and_out_of_everything(one_device, tmp_path):
@@ -188,41 +202,44 @@ def test_every_feature_at_once_without_a_ct_stays_finite_and_out_of_everything(o
         shape=(dict(kind="sdf", file="bed.nrrd"), dict(kind="plane", normal=(0, 0.2, 1), offset_mm=-21.0)),
         press=dict(direction=(0.2, 0, -1), warm_up_steps=20, indentations_mm=(5.95, 9.48, 12.38)),
     )
-    rehearsal = Rehearsal(scene, load_anatomy(scene, tmp_path))
-    assert rehearsal.model.relaxation == "global"
+    loaded = load_anatomy(scene, tmp_path)
+    rehearsal = Rehearsal(case_of(scene, loaded), loaded)
+    assert rehearsal.organ.model.relaxation == "global"
     for step in range(31):
-        rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
-        assert rehearsal.contacts.measure_penetration() <= 1e-3
-    rehearsal.update_surfaces()
-    assert np.isfinite(array_of(rehearsal.body.position)).all()
-    assert 0.6 < rehearsal.volume_ratio() < 1.1
-    assert rehearsal.scanner is None and rehearsal.rest_grid() is None
-    view = image_view(rehearsal, rehearsal.probe, initial_settings(rehearsal), Tally(0.0))
+        rehearsal.advance(rehearsal.scripted_pose(step / 30 * script_length_s(rehearsal.case)))
+        assert rehearsal.organ.contacts.measure_penetration() <= 1e-3
+    rehearsal.show()
+    anatomy = rehearsal.anatomy
+    assert np.isfinite(rehearsal.frame.positions).all()
+    assert 0.6 < anatomy.volume_ratio() < 1.1
+    assert anatomy.scanner is None and anatomy.rest_grid() is None
+    view = image_view(anatomy, rehearsal.case.probe, initial_settings(rehearsal.case))
     assert not any(image.any() for image in view.images.values())
 
 
-def test_an_image_has_the_rows_and_columns_asked_for_and_at_most_the_scenes(kept):
-    rehearsal = kept(pressed_phantom)
-    pixels = rehearsal.scene.image.pixels
+def test_an_image_has_the_rows_and_columns_asked_for_and_at_most_the_scenes(rehearsal):
+    case = rehearsal.case
+    pixels, times = case.scene.image.pixels, []
     for asked, made in (
         ((40, 30), (40, 30)),
         ((pixels + 1, 30), (pixels, 30)),
         ((30, pixels + 1), (30, pixels)),
     ):
-        view = image_view(rehearsal, rehearsal.probe, initial_settings(rehearsal), Tally(0.0), asked)
+        view = image_view(rehearsal.anatomy, case.probe, initial_settings(case), times, asked)
         assert {image.shape[:2] for image in view.images.values()} == {made}
+    assert len(times) == 3 and min(times) > 0
 
 
-def test_an_image_that_is_saved_leaves_the_persistence_of_those_shown_as_it_is(kept):
-    rehearsal = kept(pressed_phantom)
-    settings = initial_settings(rehearsal)
+def test_an_image_that_is_saved_leaves_the_persistence_of_those_shown_as_it_is(rehearsal):
+    settings = initial_settings(rehearsal.case)
     settings.persistence_percent, settings.mode = 60, "b-mode"
     poses = [rehearsal.pose_at_depth(depth) for depth in (1.0, 2.0, 3.0)]
 
     def image(pose: np.ndarray, persistence: Persistence | None) -> np.ndarray:
-        rehearsal.pose = pose
-        given = rehearsal.probe, settings, Tally(0.0), None, 0.0, persistence
-        return image_view(rehearsal, *given).images[B_MODE]
+        rehearsal.organ.pose = pose
+        rehearsal.show()
+        given = rehearsal.anatomy, rehearsal.case.probe, settings
+        return image_view(*given, persistence=persistence).images[B_MODE]
 
     first, second = Persistence(), Persistence()
     shown = [image(pose, first) for pose in poses]
@@ -234,14 +251,13 @@ def test_an_image_that_is_saved_leaves_the_persistence_of_those_shown_as_it_is(k
     assert all((own != mixed).any() for own, mixed in zip(alone[1:], shown[1:], strict=True))
 
 
-def test_the_outline_is_the_tumours_border_not_what_is_drawn_of_it(kept):
-    rehearsal = kept(pressed_phantom)
+def test_the_outline_is_the_tumours_border_not_what_is_drawn_of_it(rehearsal):
     for _ in range(20):
         rehearsal.advance(rehearsal.pose_at_depth(6.0))
-    outline = rehearsal.tumour_outline()
-    plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], 1.0, 1.0)
+    rehearsal.show()
+    anatomy = rehearsal.anatomy
+    outline, plane = anatomy.tumour_outline(), anatomy.image_plane()
     flat = np.column_stack([outline.reshape(-1, 2), np.zeros(2 * len(outline)), np.ones(2 * len(outline))])
-    carried = array_of(Skin(rehearsal.model.carrier, rehearsal.tumour.vertices).vertices)
-    border = trimesh.Trimesh(carried, rehearsal.tumour.faces, process=False)
-    away = signed_distance(border.vertices, border.faces, (flat @ plane.world_from_plane.T)[:, :3])[0]
+    places = (flat @ plane.world_from_plane.T)[:, :3]
+    away = signed_distance(anatomy.tumour_vertices, np.asarray(anatomy.tumour.faces), places)[0]
     assert len(outline) > 20 and np.abs(away).max() < 1e-3

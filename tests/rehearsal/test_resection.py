@@ -2,6 +2,7 @@
 
 import gc
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,24 +12,28 @@ import pytest
 import trimesh
 from coarse_patient import coarse_patient
 from conftest import ROOT
-from rehearsal.inputs.user_input import UserInput
-from rehearsal.open_window import geometry_of
-from rehearsal.sessions.session import Session
 
+from rehearsal.announcements import Announcements
 from rehearsal.asked_files import read_files
+from rehearsal.case import case_of
 from rehearsal.commands.command_line import CommandError
 from rehearsal.commands.rehearse_options import RehearseOptions
+from rehearsal.drawn_geometry import drawn_geometry
+from rehearsal.loop.command import BeginAction, Bookmark, Checkpoint, Load, Mark, Move, Redo, Undo
+from rehearsal.loop.timeline import Timeline
 from rehearsal.measurements.live_measurements import LiveMeasurements
+from rehearsal.notices import Notices
+from rehearsal.pressed_organ import PressedOrgan
+from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection import proposal
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.judgement import findings_of
 from rehearsal.resection.operation import (
-    cut,
+    cut_command,
     distance_to_tumour,
     mark_under,
     marks_of_image,
     places_at_rest,
-    set_marks,
 )
 from rehearsal.resection.proposal import line_around, propose, why_first
 from rehearsal.resection.resection_page import draw_page, figures_of, report_of, rows_of, save_page, why_less
@@ -47,19 +52,22 @@ from rehearsal.resection.score_file import save_score
 from rehearsal.resection.score_line import ResectionError
 from rehearsal.resection.script import ResectionScript, ScriptedAction
 from rehearsal.sessions.packed_arrays import pack_state, unpack_state
-from rehearsal.sessions.recorder import record
-from rehearsal.sessions.replay import Replay
-from rehearsal.sessions.session_file import read_log
+from rehearsal.sessions.recorder import SessionRecorder, header_of
+from rehearsal.sessions.replay import Replay, ReplayCheck
+from rehearsal.sessions.session_file import Log, read_log
+from rehearsal.sources.user import UserSource
 from rehearsal.tracking.pose_file import PoseError, load_timed_poses
 from render.viewer import Controls, Settings
+from scenes.scene import with_options
 from scenes.surfaces import signed_distance_from
-from sim.fields import Field, array_of
+from sim.fields import Field
 from ultrasound.probe_manipulator import advanced, pose_at, touching
 
 pytestmark = pytest.mark.usefixtures("arrays_stored")
 
 MARGIN_MM = 5.0
-# What the issue's readers look for.
+CUT = CutSettings("enucleoresection", MARGIN_MM)
+# What readers of a report look for.
 KEYS = (
     *("margin_min_mm", "margin_mean_mm", "positive_margin_mm2", "parenchyma_removed_ml", "specimen_ml"),
     *("collecting_system_opened_mm2", "volume_change_percent", "vessels"),
@@ -72,279 +80,274 @@ def patient(one_device):
 
 
 @pytest.fixture
-def rehearsal(patient):
+def rehearsal(patient) -> Rehearsal:
     patient[0].reset()
-    patient[0].update_surfaces()
     return patient[0]
 
 
 @pytest.fixture(scope="module")
 def marks(patient) -> np.ndarray:
     """Marks of a line around tumour and margin."""
-    whole, tumour = patient[0].whole_organ, patient[0].whole_tumour
-    return line_around(whole, tumour, MARGIN_MM, np.array([0.65, -0.75, 0.12])).marks
+    case = patient[0].case
+    return line_around(case.organ, case.tumour, MARGIN_MM, np.array([0.65, -0.75, 0.12])).marks
 
 
-def acting(rehearsal, *actions: ScriptedAction, coverage=None) -> UserInput:
-    session = Session(rehearsal, coverage=coverage)
-    return UserInput(session, script=ResectionScript(list(actions)))
+def scored(rehearsal: Rehearsal, marks: np.ndarray) -> None:
+    assert not rehearsal.do(Mark(places_mm=marks.tolist())).notices
 
 
-def moved(live: UserInput, steps: int = 1, **controls) -> None:
-    """Steps of a session; the controls are those of the first."""
-    rehearsal = live.session.rehearsal
-    for number in range(steps):
-        given = Controls(
-            Settings(young_kpa=15.0, iterations=4, substeps=1), **(controls if number == 0 else {})
-        )
-        pose = live.next_pose(given)
-        if pose is not None:
-            live.after_step(rehearsal.timed_step(pose))
-        live.after_frame()
+def cut(rehearsal: Rehearsal, settings: CutSettings = CUT, is_seen=None) -> list[str]:
+    """Cut along the score; return what the user is told."""
+    return rehearsal.do(cut_command(rehearsal.anatomy, settings, is_seen)).notices
 
 
-def resected(rehearsal, marks: np.ndarray, settings: CutSettings | None = None) -> UserInput:
-    scored = [tuple(map(float, mark + rehearsal.origin)) for mark in marks]
-    live = acting(
-        rehearsal,
-        ScriptedAction(0.0, score=scored),
-        ScriptedAction(0.0, cut=settings or CutSettings("enucleoresection", MARGIN_MM)),
-    )
-    moved(live, 2)
-    return live
+def resected(rehearsal: Rehearsal, marks: np.ndarray, settings: CutSettings = CUT) -> None:
+    scored(rehearsal, marks)
+    assert cut(rehearsal, settings) == []
+
+
+def stayed(rehearsal: Rehearsal, steps: int) -> list[Move]:
+    return [Move(pose=rehearsal.frame.pose)] * steps
+
+
+def moved_to(rehearsal: Rehearsal, pose: np.ndarray) -> None:
+    rehearsal.organ.pose = pose
+    rehearsal.show()
+
+
+def images(rehearsal: Rehearsal, *look) -> dict[str, np.ndarray]:
+    anatomy = rehearsal.anatomy
+    return anatomy.scanner.images(anatomy.image_plane(), rehearsal.case.probe, *look).by_name
 
 
 def test_a_cut_keeps_the_margin_and_undo_brings_all_back_bit_for_bit(rehearsal, marks):
-    for _ in range(3):
-        rehearsal.advance(rehearsal.pose)
-    rehearsal.update_surfaces()
-    look = rehearsal.image_plane(), rehearsal.probe, "both", "speckle", 350, 40
-    image = rehearsal.scanner.images(*look).by_name
-    before, vertices = rehearsal.digest(), array_of(rehearsal.organ_skin.vertices)
-    live = resected(rehearsal, marks)
-    cut, judged = rehearsal.cut, rehearsal.judgement
-    report = report_of(rehearsal)
+    anatomy, organ, whole = rehearsal.anatomy, rehearsal.organ, rehearsal.case.organ
+    rehearsal.do(*stayed(rehearsal, 3))
+    look = "both", "speckle", 350, 40
+    image, before, vertices = images(rehearsal, *look), organ.digest(), anatomy.vertices
+    resected(rehearsal, marks)
+    made, judged, report = anatomy.cut, anatomy.judgement, report_of(anatomy)
     assert set(KEYS) <= set(report)
     # The line is half a millimetre wider, and distances of the hull of the tumour's vertices are shorter by their chords.
     assert MARGIN_MM - 0.1 < report["margin_min_mm"] <= report["margin_mean_mm"] < MARGIN_MM + 0.6
-    assert report["positive_margin_mm2"] == report["tumour_left_ml"] == 0.0 and rehearsal.tumour is None
+    assert report["positive_margin_mm2"] == report["tumour_left_ml"] == 0.0 and anatomy.tumour is None
     assert abs(report["margin_min_as_cut_mm"] - report["margin_min_mm"]) < 0.5
     assert abs(report["volume_change_percent"]) < 0.5
-    assert cut.specimen.volume + cut.remnant.volume == pytest.approx(rehearsal.whole_organ.volume, rel=1e-9)
-    assert rehearsal.organ is cut.remnant and {"artery", "vein"} >= {v.tissue for v in judged.vessels}
-    for _ in range(20):
-        rehearsal.advance(rehearsal.pose)
-        assert not rehearsal.notice
-    assert np.isfinite(array_of(rehearsal.body.position)).all()
-    assert rehearsal.volume_ratio() == pytest.approx(1.0, abs=0.01)
+    assert made.specimen.volume + made.remnant.volume == pytest.approx(whole.volume, rel=1e-9)
+    assert anatomy.organ is made.remnant and {"artery", "vein"} >= {v.tissue for v in judged.vessels}
+    frame = rehearsal.do(*stayed(rehearsal, 20))
+    assert not frame.notices and np.isfinite(frame.positions).all()
+    assert anatomy.volume_ratio() == pytest.approx(1.0, abs=0.01)
     assert findings_of(judged)["specimen"].endswith("ml")
-    assert len(geometry_of(rehearsal).bed[1]) == cut.on_remnant.sum() > 100
-    moved(live, undo=True)
-    assert rehearsal.cut is geometry_of(rehearsal).bed is None and len(rehearsal.resection.marks) == len(
-        marks
-    )
-    moved(live, undo=True)
-    assert rehearsal.resection == NO_RESECTION and rehearsal.cut is rehearsal.judgement is None
-    assert rehearsal.digest() == before and rehearsal.organ is rehearsal.whole_organ
-    rehearsal.update_surfaces()
-    assert np.array_equal(array_of(rehearsal.organ_skin.vertices), vertices)
-    again = rehearsal.scanner.images(*look).by_name
+    assert len(drawn_geometry(anatomy).bed[1]) == made.on_remnant.sum() > 100
+    frame = rehearsal.do(Undo())
+    assert anatomy.cut is drawn_geometry(anatomy).bed is None and len(frame.resection.marks) == len(marks)
+    frame = rehearsal.do(Undo())
+    assert frame.resection == NO_RESECTION and anatomy.cut is anatomy.judgement is None
+    assert organ.digest() == before and anatomy.organ is whole
+    assert np.array_equal(anatomy.vertices, vertices)
+    again = images(rehearsal, *look)
     assert all(np.array_equal(image[name], again[name]) for name in image)
-    moved(live, redo=True)
-    moved(live, redo=True)
     # The same cut again, with other surfaces: their version shows it to what draws them.
-    cut, version, drawn = rehearsal.cut, rehearsal.geometry_version, rehearsal.organ_skin
-    moved(live, undo=True)
-    moved(live, redo=True)
-    assert rehearsal.cut is cut is not None and rehearsal.organ_skin is not drawn
-    assert rehearsal.geometry_version == version + 2
+    rehearsal.do(Redo(), Redo())
+    drawn = anatomy.drawn_organ
+    assert anatomy.cut is made and anatomy.geometry.version > 0
+    rehearsal.do(Undo())
+    assert anatomy.geometry.version == 0 and anatomy.drawn_organ is not drawn
 
 
 def test_the_images_show_the_crater(rehearsal, marks):
-    rehearsal.pose = touching_at(rehearsal, rehearsal.whole_tumour.center_mass)
-    plane = rehearsal.image_plane()
-
-    def ct() -> np.ndarray:
-        return rehearsal.scanner.images(plane, rehearsal.probe, "ct", "speckle", 2000, 0).by_name["CT"]
-
-    before = ct()
-    resected(rehearsal, marks, CutSettings("enucleoresection", MARGIN_MM, None, "air"))
-    after = ct()
+    moved_to(rehearsal, touching_at(rehearsal, rehearsal.case.tumour.center_mass))
+    look = "ct", "speckle", 2000, 0
+    before = images(rehearsal, *look)["CT"]
+    resected(rehearsal, marks, replace(CUT, filling="air"))
+    after = images(rehearsal, *look)["CT"]
     # Air is black, and fills more of the image than the tumour did.
     assert ((after == 0) & (before > 100)).sum() > 0.2 * before.size
-    moved(acting(rehearsal), undo=True)
 
 
-def touching_at(rehearsal, target: np.ndarray) -> np.ndarray:
+def touching_at(rehearsal: Rehearsal, target: np.ndarray) -> np.ndarray:
     """A pose over a point, from the direction of the tumour."""
+    case = rehearsal.case
     direction = np.array([0.65, -0.75, 0.12])
-    start = pose_at(target, -direction, np.array([0.0, 0.0, 1.0]), rehearsal.size_mm[2])
-    samples, radius = rehearsal.manipulator.samples, rehearsal.probe.radius_mm
-    return touching(advanced(start, -80.0), rehearsal.size_mm, samples, radius)
+    start = pose_at(target, -direction, np.array([0.0, 0.0, 1.0]), case.size_mm[2])
+    return touching(advanced(start, -80.0), case.size_mm, rehearsal.manipulator.samples, case.probe.radius_mm)
 
 
 def test_marks_of_the_image_are_a_margin_beside_the_tumour_on_the_capsule(rehearsal):
-    tumour = rehearsal.whole_tumour
-    rehearsal.pose = touching_at(rehearsal, tumour.center_mass)
+    anatomy, tumour = rehearsal.anatomy, rehearsal.case.tumour
+    moved_to(rehearsal, touching_at(rehearsal, tumour.center_mass))
     with pytest.raises(ResectionError, match="no lateral edge"):
         # The tumour is wider than the image.
-        marks_of_image(rehearsal, MARGIN_MM)
-    rehearsal.pose = touching_at(rehearsal, tumour.center_mass + np.array([0.0, 0.0, 12.0]))
-    plane = rehearsal.image_plane()
-    places = marks_of_image(rehearsal, MARGIN_MM)
-    assert len(places) == 1
-    on_surface = signed_distance_from(rehearsal.whole_organ, places)
-    assert abs(on_surface[0]) < 1e-3
-    now = rehearsal.model.lattice.carried(places, array_of(rehearsal.body.position))
-    across = ((now - plane.world_from_plane[:3, 3]) @ plane.world_from_plane[:3, :3])[0]
-    outline = rehearsal.tumour_outline()
+        marks_of_image(anatomy, MARGIN_MM)
+    moved_to(rehearsal, touching_at(rehearsal, tumour.center_mass + np.array([0.0, 0.0, 12.0])))
+    plane = anatomy.image_plane().world_from_plane
+    places = marks_of_image(anatomy, MARGIN_MM)
+    assert len(places) == 1 and abs(signed_distance_from(rehearsal.case.organ, places)[0]) < 1e-3
+    now = anatomy.geometry.whole.carried(places, rehearsal.frame.positions)
+    across = ((now - plane[:3, 3]) @ plane[:3, :3])[0]
+    outline = anatomy.tumour_outline()
     edges = outline[..., 0].min() - MARGIN_MM, outline[..., 0].max() + MARGIN_MM
     # float32 of the skin.
     assert min(abs(across[0] - edge) for edge in edges) < 1e-2 and abs(across[2]) < 1e-2
 
 
 def test_a_mark_under_the_mouse_is_where_the_ray_first_meets_the_organ(rehearsal):
-    place = rehearsal.whole_organ.vertices[np.argmax(rehearsal.whole_organ.vertices[:, 0])]
-    now = array_of(rehearsal.organ_skin.vertices).astype(float)
-    target = now[np.argmax(rehearsal.whole_organ.vertices[:, 0])]
-    ray = target + [50.0, 0, 0], np.array([-1.0, 0, 0])
-    assert np.linalg.norm(mark_under(rehearsal, *ray)[0] - place) < 0.1
+    anatomy, rest = rehearsal.anatomy, rehearsal.case.organ.vertices
+    farthest = np.argmax(rest[:, 0])
+    start = anatomy.vertices[farthest] + [50.0, 0, 0]
+    assert np.linalg.norm(mark_under(anatomy, start, np.array([-1.0, 0, 0]))[0] - rest[farthest]) < 0.1
     with pytest.raises(ResectionError, match="not on the organ"):
-        mark_under(rehearsal, target + [50.0, 0, 0], np.array([1.0, 0, 0]))
+        mark_under(anatomy, start, np.array([1.0, 0, 0]))
+
+
+def around_hilum(rehearsal: Rehearsal, marks: np.ndarray) -> np.ndarray:
+    hilum = np.array(rehearsal.case.scene.attachment.at_mm)
+    angles = np.linspace(0, 2 * np.pi, 9)[:-1]
+    ring = np.column_stack([np.zeros(8), np.cos(angles), np.sin(angles)])
+    return places_at_rest(rehearsal.case, hilum + 14 * ring)
+
+
+def scaled(factor: float):
+    """Marks so many times as far from their middle, on the capsule."""
+
+    def made(rehearsal: Rehearsal, marks: np.ndarray) -> np.ndarray:
+        middle = marks.mean(axis=0)
+        middle = places_at_rest(rehearsal.case, middle[None] + rehearsal.case.origin)
+        wide = middle + factor * (marks - marks.mean(axis=0))
+        return places_at_rest(rehearsal.case, wide + rehearsal.case.origin)
+
+    return made
 
 
 @pytest.mark.parametrize(
-    ("settings", "text"),
+    ("line", "settings", "words"),
     [
-        (CutSettings("wedge", 5.0, 60.0), "of the organ, expected at most"),
-        (CutSettings("enucleoresection", 5.0, 0.01), "removes only"),
+        (lambda rehearsal, marks: marks[:0], CUT, "the score has 0 marks"),
+        (scaled(4.0), replace(CUT, depth_mm=60.0, technique="wedge"), "of the organ, expected at most"),
+        (scaled(0.1), replace(CUT, depth_mm=0.01), "removes only"),
+        (around_hilum, replace(CUT, depth_mm=25.0), "hilum"),
     ],
 )
-def test_absurd_cuts_are_refused_in_words_and_change_nothing(rehearsal, marks, settings, text):
-    # Around most of the organ, or a scratch.
-    middle = places_at_rest(rehearsal, marks.mean(axis=0)[None] + rehearsal.origin)
-    wide = middle + (4.0 if settings.depth_mm == 60.0 else 0.1) * (marks - marks.mean(axis=0))
-    set_marks(Session(rehearsal), places_at_rest(rehearsal, wide + rehearsal.origin))
-    state, live = rehearsal.resection, acting(rehearsal, ScriptedAction(0.0, cut=settings))
-    moved(live)
-    (notice,) = live.notices.present(lambda words: words)
-    assert text in notice and rehearsal.resection == state and rehearsal.cut is None
+def test_cuts_that_nobody_would_make_are_refused_in_words_and_change_nothing(
+    rehearsal, marks, line, settings, words
+):
+    if len(places := line(rehearsal, marks)):
+        scored(rehearsal, places)
+    before = rehearsal.frame
+    (notice,) = cut(rehearsal, settings)
+    assert words in notice and rehearsal.anatomy.cut is None
+    assert rehearsal.frame.resection == before.resection and rehearsal.frame.number == before.number
 
 
-def test_what_cannot_be_done_is_refused_in_words(rehearsal, marks):
-    live = acting(rehearsal, ScriptedAction(0.0, cut=CutSettings()))
-    moved(live)
-    assert "0 marks" in live.notices.present(lambda words: words)[0]
-    live = acting(
-        rehearsal,
-        ScriptedAction(0.0, score=[tuple(map(float, mark + rehearsal.origin)) for mark in marks]),
-        ScriptedAction(0.0, cut=CutSettings()),
-        coverage=lambda: LiveMeasurements(rehearsal).coverage,
-    )
-    moved(live, 2)
-    assert "no part of the tumour was seen" in live.notices.present(lambda words: words)[0]
-    every_other = SimpleNamespace(is_seen=lambda points: np.arange(len(points)) % 2 == 0)
-    live = acting(rehearsal, ScriptedAction(0.0, cut=CutSettings()), coverage=lambda: every_other)
-    moved(live)
-    assert rehearsal.cut is not None and "tumour surface seen 50 %" in live.notices.present()[0]
-
-
-def test_a_cut_through_the_hilum_is_refused(rehearsal):
-    hilum = np.array(rehearsal.scene.attachment.at_mm) - rehearsal.origin
-    around = [hilum + 14 * np.array([0.0, np.cos(a), np.sin(a)]) for a in np.linspace(0, 2 * np.pi, 9)[:-1]]
-    set_marks(Session(rehearsal), places_at_rest(rehearsal, np.array(around) + rehearsal.origin))
-    live = acting(rehearsal, ScriptedAction(0.0, cut=CutSettings("enucleoresection", 5.0, 25.0)))
-    moved(live)
-    assert "hilum" in live.notices.present(lambda words: words)[0] and rehearsal.cut is None
-
-
-def test_a_session_with_a_cut_replays_bit_for_bit_from_everywhere(patient, rehearsal, marks, tmp_path):
-    scored = [tuple(map(float, mark + rehearsal.origin)) for mark in marks]
-    far = tuple(map(float, 2 * marks[0] - 3 * marks.mean(axis=0) + rehearsal.origin))
-    session = Session(rehearsal)
-    recorder = record(session, patient[1], "x64", tmp_path)
-    step_s = rehearsal.settings.time_step_s
-    actions = [
-        ScriptedAction(3 * step_s, score=scored[:8]),
-        ScriptedAction(5 * step_s, score=scored[8:]),
-        ScriptedAction(6 * step_s, score=[far, scored[8]]),
-        ScriptedAction(10 * step_s, cut=CutSettings("enucleoresection", MARGIN_MM)),
-    ]
-    live = UserInput(session, recorder, script=ResectionScript(actions))
-    moved(live, 8)
-    # A line with the far mark could not be cut.
-    assert len(rehearsal.resection.marks) > len(marks)
-    moved(live, 5, undo=True)
-    assert rehearsal.cut is not None and len(rehearsal.resection.marks) == len(marks)
-    moved(live, bookmark=True)
-    moved(live, 4, undo=True)
-    assert rehearsal.cut is None and len(rehearsal.resection.marks) == len(marks)
-    moved(live, 6, redo=True)
-    moved(live, 3, bookmark=True)
-    report, digest = report_of(rehearsal), rehearsal.digest()
-    recorder.close({})
-    log = read_log(recorder.path)
-    for at_s in (0.0, log.length_s - step_s):
-        rehearsal.reset()
-        replay = Replay(rehearsal, log)
-        assert (replay.begin_at(at_s) > 0) == (at_s > 0)
-        for _ in replay.go_to(log.length_s):
-            pass
-        assert replay.differs_s is None and rehearsal.digest() == digest
-        assert report_of(rehearsal) == report
-
-
-def test_undo_of_a_cut_restores_friction_under_a_pressing_probe(rehearsal, marks):
-    direction = np.array([0.65, -0.75, 0.12])
-    start = touching_at(rehearsal, rehearsal.whole_tumour.center_mass)
-    rehearsal.pose = start
-    for number in range(12):
-        rehearsal.advance(advanced(start, 0.5 * number))
-
-    def dragged() -> str:
-        pressed = rehearsal.pose
-        for number in range(4):
-            aside = np.eye(4)
-            aside[:3, 3] = 0.3 * (number + 1) * np.cross(direction, [1.0, 0, 0])
-            rehearsal.advance(aside @ pressed)
-        return rehearsal.digest()
-
-    before = rehearsal.snapshot()
-    digest = dragged()
-    rehearsal.restore(before)
-    set_marks(Session(rehearsal), marks)
-    cut(Session(rehearsal), CutSettings("enucleoresection", MARGIN_MM), None)
-    rehearsal.restore(before)
-    assert rehearsal.contacts.has_friction and dragged() == digest
+def test_a_cut_needs_to_have_seen_the_tumour_and_warns_where_it_saw_little(rehearsal, marks):
+    scored(rehearsal, marks)
+    coverage = LiveMeasurements(rehearsal.anatomy, rehearsal.manipulator).coverage
+    (notice,) = cut(rehearsal, is_seen=coverage.is_seen)
+    assert "no part of the tumour was seen" in notice and rehearsal.anatomy.cut is None
+    assert cut(rehearsal, is_seen=lambda points: np.arange(len(points)) % 2 == 0) == []
+    told = Notices()
+    Announcements(rehearsal.anatomy, told).observe(rehearsal.frame, rehearsal.case.probe)
+    assert "tumour surface seen 50 %" in told.present()[0]
 
 
 def test_a_part_that_cannot_be_cut_refuses_the_cut_before_anything_changes(rehearsal, marks, monkeypatch):
-    vessels = rehearsal.whole_parts["vessel"].copy()
-    vessels.faces = np.vstack([vessels.faces[0][::-1], vessels.faces[1:]])
-    set_marks(Session(rehearsal), marks)
-    before = rehearsal.model.lattice
-    monkeypatch.setitem(rehearsal.whole_parts, "vessel", vessels)
-    live = acting(rehearsal, ScriptedAction(0.0, cut=CutSettings("enucleoresection", MARGIN_MM)))
-    moved(live)
-    assert "cannot be cut" in live.notices.present(lambda words: words)[0]
-    assert rehearsal.cut is None and rehearsal.model.lattice is before and rehearsal.resection.cut is None
+    scored(rehearsal, marks)
+    vessels, lattice = rehearsal.case.parts["vessel"], rehearsal.organ.model.lattice
+    monkeypatch.setattr(vessels, "faces", np.vstack([vessels.faces[0][::-1], vessels.faces[1:]]))
+    (notice,) = cut(rehearsal)
+    assert "cannot be cut" in notice and rehearsal.anatomy.cut is None
+    assert rehearsal.organ.model.lattice is lattice and rehearsal.frame.resection.cut is None
+
+
+def test_the_papers_model_cannot_be_cut_and_says_so(patient, rehearsal, marks):
+    scene, loaded = rehearsal.case.scene, patient[1]
+    particles = with_options(scene, {"tissue.model": "shape-matching", "tissue.radius_mm": 8.0})
+    timeline = Timeline(PressedOrgan(case_of(particles, loaded)))
+    timeline.apply(Mark(places_mm=marks.tolist()))
+    timeline.apply(cut_command(rehearsal.anatomy, CUT, None))
+    (notice,) = timeline.frame().notices
+    assert "cannot be cut; choose --model neo-hookean" in notice and timeline.geometry.cut is None
+
+
+def replayed(rehearsal: Rehearsal, log: Log, at_s: float) -> tuple[int, ReplayCheck]:
+    """Replay a session from the last whole state before a time [s]; the place of the first command, and the comparison."""
+    rehearsal.reset()
+    replay, check = Replay(log, one_by_one=True), ReplayCheck(log, Notices())
+    rehearsal.do(*replay.begin(rehearsal.frame.positions, at_s))
+    begun = replay.place
+    while not replay.is_over:
+        rehearsal.do(*replay.commands(rehearsal.frame, Controls(Settings()), 1.0))
+        check.observe(rehearsal.frame, rehearsal.case.probe)
+    return begun, check
+
+
+def test_a_session_with_a_cut_replays_bit_for_bit_from_everywhere(patient, rehearsal, marks, tmp_path):
+    case, organ, anatomy = rehearsal.case, rehearsal.organ, rehearsal.anatomy
+    far = places_at_rest(case, (2 * marks[0] - 3 * marks.mean(axis=0) + case.origin)[None])
+    step_s = case.scene.solver.time_step_s
+    header = header_of(case, patient[1], "x64", organ.model.serial, step_s, None)
+    recorder = SessionRecorder(tmp_path / "session", header, Notices())
+
+    def done(*commands, steps: int = 4) -> None:
+        recorder.observe(rehearsal.do(*commands, *stayed(rehearsal, steps)))
+
+    done(Mark(places_mm=marks[:8].tolist()))
+    done(Mark(places_mm=marks[8:].tolist()))
+    # A line with the far mark could not be cut.
+    done(Mark(places_mm=far.tolist()), Undo())
+    done(cut_command(anatomy, CUT, None))
+    assert anatomy.cut is not None and len(rehearsal.frame.resection.marks) == len(marks)
+    done(Bookmark())
+    done(Undo())
+    assert anatomy.cut is None
+    done(Redo())
+    done(Bookmark(), Checkpoint())
+    report, digest = report_of(anatomy), organ.digest()
+    recorder.close({})
+    log = read_log(recorder.path)
+    for at_s in (0.0, log.length_s - step_s):
+        begun, check = replayed(rehearsal, log, at_s)
+        assert (begun > 0) == (at_s > 0) and check.differs_s is None
+        assert organ.digest() == digest and report_of(anatomy) == report
+
+
+def test_undo_of_a_cut_restores_friction_under_a_pressing_probe(rehearsal, marks):
+    start = touching_at(rehearsal, rehearsal.case.tumour.center_mass)
+    rehearsal.organ.pose = start
+    rehearsal.do(*(Move(pose=advanced(start, 0.5 * number)) for number in range(12)))
+    assert rehearsal.organ.contacts.has_friction
+
+    def dragged() -> str:
+        aside, pressed = np.cross([0.65, -0.75, 0.12], [1.0, 0, 0]), rehearsal.frame.pose
+        for number in range(1, 5):
+            pose = pressed.copy()
+            pose[:3, 3] += 0.3 * number * aside
+            rehearsal.do(Move(pose=pose))
+        return rehearsal.organ.digest()
+
+    rehearsal.do(BeginAction())
+    digest = dragged()
+    rehearsal.do(Undo())
+    resected(rehearsal, marks)
+    rehearsal.do(Undo(), Undo())
+    assert dragged() == digest
 
 
 def test_cuts_that_are_undone_leave_no_fields_and_a_cut_survives_as_text(rehearsal, marks):
-    set_marks(Session(rehearsal), marks)
-    uncut = rehearsal.snapshot()
-    cut(Session(rehearsal), CutSettings("enucleoresection", MARGIN_MM), None)
-    cut_out = rehearsal.snapshot()
-    rehearsal.reset()
-    assert rehearsal.cut is None
-    from_text = unpack_state(pack_state(cut_out), rehearsal.settled)
+    timeline, anatomy = rehearsal.stepper.timeline, rehearsal.anatomy
+    scored(rehearsal, marks)
+    uncut = timeline.whole_state()
+    assert cut(rehearsal) == []
+    cut_out = timeline.whole_state()
+    from_text = unpack_state(pack_state(cut_out), rehearsal.frame.positions)
     assert from_text.resection == cut_out.resection
     fields = []
     for _ in range(4):
-        rehearsal.restore(uncut)
-        assert rehearsal.cut is None
-        rehearsal.restore(from_text)
-        assert rehearsal.cut is not None
+        rehearsal.do(Load(state=uncut))
+        assert anatomy.cut is None
+        rehearsal.do(Load(state=from_text))
+        assert anatomy.cut is not None
         gc.collect()
         fields.append(sum(isinstance(each, Field) for each in gc.get_objects()))
     assert fields[1] == fields[3]
@@ -362,59 +365,86 @@ def test_the_distance_of_a_line_to_the_tumour_is_negative_over_it():
 
 
 def test_the_view_warns_of_a_line_that_is_too_near_and_shows_the_coming_cut(rehearsal, marks):
-    shown = ResectionView(rehearsal)
-    seen = LiveMeasurements(rehearsal).coverage
-    seen.seen[:] = True
-    shown.update(CutSettings(), seen.is_seen, 0.0)
+    anatomy = rehearsal.anatomy
+    shown, seen = ResectionView(anatomy), LiveMeasurements(anatomy, rehearsal.manipulator).coverage
+
+    def look(time_s: float, is_seen: bool) -> None:
+        """Update at a time, after images that have shown all or nothing."""
+        seen.seen[:] = is_seen
+        anatomy.show(replace(rehearsal.frame, time_s=time_s))
+        shown.update(CutSettings(), seen.is_seen)
+
+    look(0.0, True)
     assert shown.score(MARGIN_MM) is None and shown.status(CutSettings()) == ""
-    rehearsal.set_resection(Resection().with_marks(marks))
-    shown.update(CutSettings(), seen.is_seen, 0.0)
-    score = shown.score(MARGIN_MM)
-    assert not score.is_near.any() and "margin" not in shown.status(CutSettings())
+    scored(rehearsal, marks)
+    look(0.0, True)
+    assert not shown.score(MARGIN_MM).is_near.any() and "margin" not in shown.status(CutSettings())
     # Between marks a geodesic may be nearer than they are, by the sagitta of their arc.
-    assert distance_to_tumour(rehearsal.score, rehearsal.whole_tumour).min() > MARGIN_MM - 0.5
+    assert shown.tumour_mm.min() > MARGIN_MM - 0.5
     assert shown.score(MARGIN_MM + 2.0).is_near.all()
     assert "red: " in shown.status(CutSettings(margin_mm=MARGIN_MM + 2.0))
-    assert f"{rehearsal.score.length_mm:.0f} mm" in shown.status(CutSettings())
+    assert f"{shown.line.length_mm:.0f} mm" in shown.status(CutSettings())
     assert "seen" not in shown.status(CutSettings())
-    seen.seen[:] = False
-    shown.update(CutSettings(), seen.is_seen, 1.0)
+    look(1.0, False)
     assert "no part of the tumour was seen" in shown.status(CutSettings())
     assert "tumour surface seen 0 %" in shown.status(CutSettings())
     assert "surface seen" not in shown.status(CutSettings(depth_mm=12.0))
-    assert shown.section(np.eye(4)) is None
-    seen.seen[:] = True
-    shown.update(CutSettings(), seen.is_seen, 2.0)
-    rehearsal.pose = touching_at(rehearsal, rehearsal.whole_tumour.center_mass)
-    plane = rehearsal.image_plane()
-    section = shown.section(np.linalg.inv(plane.world_from_plane))
-    depth = section[..., 1].max() - rehearsal.tumour_outline()[..., 1].max()
+    assert shown.section() is None
+    moved_to(rehearsal, touching_at(rehearsal, rehearsal.case.tumour.center_mass))
+    look(2.0, True)
+    depth = shown.section()[..., 1].max() - anatomy.tumour_outline()[..., 1].max()
     assert MARGIN_MM - 1.0 < depth < MARGIN_MM + 1.0
     assert asdict(cut_settings(Settings(cut_depth_mm=12, air_in_crater=True, technique="wedge"))) == dict(
         technique="wedge", margin_mm=5.0, depth_mm=12.0, filling="air"
     )
 
 
-def test_it_is_cut_but_once_and_page_score_and_plan_are_written_and_compared(
-    patient, rehearsal, marks, tmp_path, monkeypatch
-):
-    _, anatomy = patient
+def source_of(
+    rehearsal: Rehearsal, *actions: ScriptedAction, plan: ResectionPlan | None = None
+) -> UserSource:
+    """A user whose script acts."""
+    script = ResectionScript(list(actions))
+    return UserSource(rehearsal.anatomy, rehearsal.manipulator, Notices(), script=script, resection_plan=plan)
+
+
+def acted(rehearsal: Rehearsal, source: UserSource, **controls) -> list[str]:
+    """The frame after a user's controls; return what the user is told."""
+    given = Controls(Settings(young_kpa=15.0, iterations=4, substeps=1), **controls)
+    frame = rehearsal.do(*source.commands(rehearsal.frame, given, 1 / 60))
+    return [*frame.notices, *source.notices.present()]
+
+
+def in_patient(rehearsal: Rehearsal, marks: np.ndarray) -> Sequence[tuple[float, float, float]]:
+    return [tuple(map(float, mark + rehearsal.case.origin)) for mark in marks]
+
+
+def test_a_script_acts_at_its_times_and_cuts_but_once(rehearsal, marks):
+    score, again = in_patient(rehearsal, marks), ScriptedAction(0.09, score=[(0.0, 0.0, 0.0)])
+    actions = ScriptedAction(0.03, score=score), ScriptedAction(0.06, cut=CUT), ScriptedAction(0.08, cut=CUT)
+    source, told, made = source_of(rehearsal, *actions, again), [], []
+    for _ in range(8):
+        told += acted(rehearsal, source)
+        frame = rehearsal.frame
+        made.append((round(60 * frame.time_s), len(frame.resection.marks), frame.geometry.cut is not None))
+    is_scored, is_cut = ([at for at, *done in made if done[which]] for which in (0, 1))
+    # A frame of 1/60 s after it is due.
+    assert (is_scored[0], is_cut[0]) == (3, 5) and made[-1][1] == len(marks)
+    assert len(told) == 2 and all("cut out already" in notice for notice in told)
+
+
+def test_page_score_and_plan_are_written_and_compared(patient, rehearsal, marks, tmp_path, monkeypatch):
+    case, anatomy = patient[1], rehearsal.anatomy
     resected(rehearsal, marks)
-    again = ScriptedAction(0.0, cut=CutSettings()), ScriptedAction(0.0, score=[(0.0, 0.0, 0.0)])
-    live = acting(rehearsal, *again)
-    moved(live, 2)
-    notices = live.notices.present(lambda words: words)
-    assert all("cut out already" in notice for notice in notices) and len(notices) == 2
     # A line takes half a second: from fewer directions.
     few = SimpleNamespace(vertices=trimesh.creation.icosahedron().vertices[::4])
     creation = SimpleNamespace(icosahedron=lambda: few)
     monkeypatch.setattr(proposal, "trimesh", SimpleNamespace(creation=creation))
-    about = anatomy.organ, anatomy.tumour, anatomy.parts, MARGIN_MM, anatomy.labels, anatomy.tissues
+    about = case.organ, case.tumour, case.parts, MARGIN_MM, case.labels, case.tissues
     proposals = propose(*about)
     # What is refused when it is cut is not proposed.
     monkeypatch.setattr(proposal, "_lines", lambda *_: [proposals[0].cut.line])
     with pytest.raises(ResectionError, match="hilum"):
-        propose(*about, trimesh.creation.icosphere().apply_translation(anatomy.tumour.center_mass))
+        propose(*about, trimesh.creation.icosphere().apply_translation(case.tumour.center_mass))
     costs = [each.cost_ml for each in proposals]
     assert len(costs) > 1 and costs == sorted(costs) and proposals[0].settings.technique == "enucleoresection"
     assert proposals[0].judgement.margin.margin_mm.min() > MARGIN_MM - 0.1
@@ -424,12 +454,12 @@ def test_it_is_cut_but_once_and_page_score_and_plan_are_written_and_compared(
     )
     assert why_first(proposals[:1]) == "" and "None" not in why
     best = proposals[0]
-    figures = figures_of(best.cut, best.judgement, anatomy.tumour)
+    figures = figures_of(best.cut, best.judgement, case.tumour)
     assert (
         "tumour surface seen" not in dict(rows_of(figures))
         and figures["score_to_tumour_mm"] > MARGIN_MM - 0.5
     )
-    draw_page(best.cut, best.judgement, anatomy.tumour, figures, tmp_path / "plan.png", "Planned resection")
+    draw_page(best.cut, best.judgement, case.tumour, figures, tmp_path / "plan.png", "Planned resection")
     assert (tmp_path / "plan.png").stat().st_size > 10_000
     cuts = [planned_cut(each, np.zeros(3)) for each in proposals]
     plan, path = ResectionPlan(anatomy="a", margin_mm=MARGIN_MM, cuts=cuts), tmp_path / "plan.json"
@@ -438,7 +468,7 @@ def test_it_is_cut_but_once_and_page_score_and_plan_are_written_and_compared(
     with pytest.raises(CommandError, match="the scripted press cuts nothing; open it in a window, or add"):
         read_files(RehearseOptions(headless=True, plan=path))
     assert read_files(RehearseOptions(plan=path)).resection_plan == plan
-    report = report_of(rehearsal, plan)
+    report = report_of(anatomy, plan)
     # The rehearsed line is the planned one.
     assert report["against_plan"]["parenchyma_removed_ml_more"] == pytest.approx(0.0, abs=0.05)
     less_planned = best.judgement.report() | dict(
@@ -450,7 +480,7 @@ def test_it_is_cut_but_once_and_page_score_and_plan_are_written_and_compared(
     difference = against_plan(report["against_plan"] | more | dict(collecting_system_opened_mm2_more=None))
     assert difference.endswith(f" by {cuts[0].technique}: parenchyma +1.3 ml, least margin -0.5 mm")
     assert dict(rows_of(report))["against the plan"].startswith("cost ")
-    page, figures = save_page(rehearsal, report, tmp_path)
+    page, figures = save_page(anatomy, report, tmp_path)
     assert page.stat().st_size > 10_000 and json.loads(figures.read_text()) == report
     assert dict(rows_of(report))["positive margin"].startswith("0 mm2")
     assert why_less(report) == []
@@ -459,19 +489,18 @@ def test_it_is_cut_but_once_and_page_score_and_plan_are_written_and_compared(
     assert (
         "surface seen; the score" in dict(rows_of(less | dict(tumour_seen_percent=53.4)))["less than asked"]
     )
-    curve = json.loads(save_score(rehearsal, tmp_path).read_text())["markups"][0]
+    curve = json.loads(save_score(rehearsal.case, anatomy.cut.line, tmp_path).read_text())["markups"][0]
     points = np.array([point["position"] for point in curve["controlPoints"]])
     assert curve["type"] == "ClosedCurve" and curve["coordinateSystem"] == "LPS"
-    assert np.abs(signed_distance_from(anatomy.organ, points)).max() < 0.3
+    assert np.abs(signed_distance_from(case.organ, points)).max() < 0.3
     rehearsal.reset()
-    live = UserInput(Session(rehearsal), resection_plan=plan)
-    set_marks(live.session, marks[:3])
-    moved(live, score_planned=True)
-    assert np.abs(rehearsal.score.points + rehearsal.origin - np.array(plan.best.line_mm)).max() < 0.05
-    assert "for enucleoresection with a margin of 5 mm" in live.notices.present()[0]
-    live = UserInput(Session(rehearsal))
-    moved(live, score_planned=True)
-    assert "no planned line; make a plan" in live.notices.present()[0]
+    scored(rehearsal, marks[:3])
+    told = acted(rehearsal, source_of(rehearsal, plan=plan), score_planned=True)
+    planned = rehearsal.frame.resection.points() + rehearsal.case.origin
+    assert np.abs(planned - np.array(plan.best.marks_mm)).max() < 0.05
+    assert "for enucleoresection with a margin of 5 mm" in told[0]
+    told = acted(rehearsal, source_of(rehearsal), score_planned=True)
+    assert "no planned line; make a plan" in told[0]
     whole = path.read_text()
     path.write_text(whole.replace('"margin_min_mm"', '"margin_minimum_mm"'))
     with pytest.raises(ResectionPlanError, match="margin_min_mm is no number"):
@@ -502,22 +531,6 @@ def test_a_script_with_a_mistake_is_refused_with_its_place(tmp_path: Path, entry
     path.write_text(json.dumps([{"time_s": 0.0, "probe_to_patient": np.eye(4).tolist()} | entry]))
     with pytest.raises(PoseError, match=f"pose 1, .*{text}"):
         load_timed_poses(path)
-
-
-def test_the_paper_model_cannot_be_cut_and_says_so(rehearsal, marks):
-    class Particles:
-        """A model without elements."""
-
-    elements, scene = rehearsal.model, rehearsal.scene
-    set_marks(Session(rehearsal), marks)
-    try:
-        rehearsal.model = Particles()
-        live = acting(rehearsal, ScriptedAction(0.0, cut=CutSettings()))
-        live._operate(Controls(Settings()))
-    finally:
-        rehearsal.model = elements
-    assert "cannot be cut; choose --model neo-hookean" in live.notices.present(lambda words: words)[0]
-    assert rehearsal.cut is None and rehearsal.scene is scene
 
 
 def test_a_resection_is_a_value():

@@ -6,13 +6,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from plan_ball import SIZE, R, X, Y, Z, big_ball, manipulator_on
+from plan_ball import SIZE, R, X, Y, Z, big_ball, case_of_ball, manipulator_on
 
 from rehearsal.planning import rigid_surrogate
 from rehearsal.planning.rigid_surrogate import RigidSurrogate
 from rehearsal.planning.sweep_path import tilted
 from rehearsal.planning.sweep_score import MEANS
 from rehearsal.planning.sweep_trial import Trial
+from scenes.scene import Scene, with_options
 from sim.fields import field_of
 from ultrasound.coverage import VOXEL_MM, Coverage
 from ultrasound.probe import load_probe
@@ -21,34 +22,21 @@ from ultrasound.probe_manipulator import pose_at
 pytestmark = pytest.mark.usefixtures("one_device")
 
 
-class Unmoved:
-    """A skin of tissue that has not settled."""
-
-    def __init__(self, model: None, places: np.ndarray) -> None:
-        self.vertices = field_of(places, 1)
-
-    def update(self) -> None: ...
-
-
 GAP_MM, WARNING_MM = 1.5, 2.0
 TUMOUR_MM, AT = 8.0, np.array([2.0, -3.0, 14.0])
 
 
-def surrogate_of(monkeypatch, probe) -> tuple[RigidSurrogate, Coverage]:
-    monkeypatch.setattr(rigid_surrogate, "Skin", Unmoved)
+def surrogate_of(probe) -> tuple[RigidSurrogate, Coverage]:
+    """A surrogate of tissue that has not settled."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=TUMOUR_MM).apply_translation(AT)
     coverage = Coverage(big_ball(), ball)
-    scene = SimpleNamespace(
-        image=SimpleNamespace(coupling_gap_mm=GAP_MM),
-        transducer=SimpleNamespace(compression_warning_mm=WARNING_MM),
-    )
-    size = np.array(probe.housing_mm)
-    held = SimpleNamespace(
-        manipulator=manipulator_on(big_ball(), size), model=None, probe=probe, scene=scene, size_mm=size
-    )
-    held.reset = lambda: None
+    options = {"image.contact_gap_mm": GAP_MM, "transducer.compression_warning_mm": WARNING_MM}
+    case = case_of_ball(scene=with_options(Scene(anatomy={}), options), probe=probe)
+    anatomy = SimpleNamespace(skin=lambda places: SimpleNamespace(vertices=field_of(places, 1)))
     trial = SimpleNamespace(
-        rehearsal=held,
+        case=case,
+        rehearsal=SimpleNamespace(anatomy=anatomy, reset=lambda: None),
+        manipulator=manipulator_on(big_ball(), case.size_mm),
         sampled_places=coverage.voxel_centres("tumour"),
         held=lambda passes: np.concatenate(passes)[:, 0, 3] < 100.0,
     )
@@ -71,9 +59,9 @@ def kind_with(poses: np.ndarray | None) -> SimpleNamespace:
 
 
 @pytest.mark.parametrize("name", ["linear", "drop-in", "curvilinear"])
-def test_the_surrogate_agrees_with_counting_voxels_one_by_one(monkeypatch, name):
+def test_the_surrogate_agrees_with_counting_voxels_one_by_one(name):
     probe = load_probe(name)
-    found, coverage = surrogate_of(monkeypatch, probe)
+    found, coverage = surrogate_of(probe)
     length = float(probe.housing_mm[2])
     poses = path_over_the_tumour(length)
     tried = found.try_pass(kind_with(poses), np.arange(3.0))
@@ -129,8 +117,8 @@ def depth_of_array(probe, pose: np.ndarray, length: float) -> np.ndarray:
     return R - np.linalg.norm(np.array(at)[:, :3], axis=1)
 
 
-def test_a_pass_that_cannot_be_held_is_not_tried_and_the_same_pass_gives_the_same(monkeypatch):
-    found, _ = surrogate_of(monkeypatch, load_probe("linear"))
+def test_a_pass_that_cannot_be_held_is_not_tried_and_the_same_pass_gives_the_same():
+    found, _ = surrogate_of(load_probe("linear"))
     poses = path_over_the_tumour(SIZE[2])
     one, again = (found.try_pass(kind_with(poses), np.zeros(0)) for _ in range(2))
     assert np.array_equal(one.seen, again.seen) and np.array_equal(one.sums, again.sums)
@@ -139,4 +127,4 @@ def test_a_pass_that_cannot_be_held_is_not_tried_and_the_same_pass_gives_the_sam
     for beside in (None, out_of_reach):
         assert found.try_pass(kind_with(beside), np.zeros(0)) is None
     # It makes passes with fewer samples, and does not change the manipulator of the trials.
-    assert len(found.manipulator.samples) < len(found.trial.rehearsal.manipulator.samples)
+    assert len(found.manipulator.samples) < len(found.trial.manipulator.samples)

@@ -9,6 +9,7 @@ from conftest import rotation_about
 from cut_ball import ANGLE, R, ball, circle, inset
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plan_ball import case_of_ball
 
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.operation import _nearest_to_probe
@@ -165,19 +166,23 @@ def test_a_mark_of_the_image_is_on_the_capsule_nearest_to_the_probe(across_mm):
 
 def test_the_status_of_a_score_says_how_near_and_how_much_was_seen():
     """A point that is half a millimetre nearer than the margin is not near."""
-    marks = np.zeros((7, 3))
-    score = SimpleNamespace(length_mm=81.6)
-    state = SimpleNamespace(marks=marks.tolist())
-    rehearsal = SimpleNamespace(
-        resection=state, cut=None, score=score, score_points=lambda: (np.zeros((3, 3)), marks)
+    anatomy = SimpleNamespace(
+        case=case_of_ball(organ=ORGAN),
+        frame=SimpleNamespace(resection=NO_RESECTION.with_marks(circle(7)), time_s=0.0),
+        geometry=SimpleNamespace(version=0, whole=None),
+        cut=None,
+        skin=lambda points: SimpleNamespace(update=lambda: None, vertices=SimpleNamespace(memory=points)),
     )
-    view = ResectionView(rehearsal)
+    view, wedge = ResectionView(anatomy), CutSettings("wedge", 5.0)
+    assert view.score(5.0) is None and view.status(wedge) == ""
+    view.update(wedge, lambda points: np.ones(len(points), bool))
     view.tumour_mm, view.seen_share = np.array([4.6, 3.27, 9.0]), 0.63
-    assert view.status(CutSettings("wedge", 5.0)) == (
-        "tumour surface seen 63 %   red: 3.3 of 5 mm margin   SCORE 7 marks 82 mm   wedge"
+    length = f"{score_line(ORGAN, circle(7)).length_mm:.0f}"
+    assert view.status(wedge) == (
+        f"tumour surface seen 63 %   red: 3.3 of 5 mm margin   SCORE 7 marks {length} mm   wedge"
     )
     assert view.score(5.0).is_near.tolist() == [False, True, False]
-    assert view.status(CutSettings("enucleation", 3.5, 12.0)) == "SCORE 7 marks 82 mm   enucleation"
+    assert view.status(CutSettings("enucleation", 3.5, 12.0)) == f"SCORE 7 marks {length} mm   enucleation"
 
 
 def test_marks_are_added_until_there_are_too_many_or_a_cut():

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from coarse_patient import coarse_patient
 
+from rehearsal.case import case_of
 from rehearsal.rehearsal import Rehearsal
 from scenes.scene import with_options
 from sim import kernels
@@ -15,10 +16,9 @@ LOOK = "both", "elevation", 350.0, 40.0
 def used(rehearsal: Rehearsal) -> None:
     """A press of one step, its pictures and measurements."""
     rehearsal.advance(rehearsal.pose_at_depth(1.0))
-    rehearsal.update_surfaces()
-    rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK)
-    rehearsal.contacts.measure_penetration()
-    rehearsal.wrench()
+    rehearsal.show()
+    rehearsal.anatomy.scanner.images(rehearsal.anatomy.image_plane(), rehearsal.case.probe, *LOOK)
+    rehearsal.organ.contacts.measure_penetration()
 
 
 def test_a_patient_of_another_size_compiles_nothing(device, monkeypatch):
@@ -34,8 +34,10 @@ def test_a_patient_of_another_size_compiles_nothing(device, monkeypatch):
     monkeypatch.setattr(kernels._Compiled, "__init__", counted)
     organ = anatomy.organ.copy()
     organ.apply_transform(np.diag([1.1, 0.9, 1.05, 1.0]))
-    scene = with_options(first.scene, {"tissue.cell_mm": 7.0})
-    other = Rehearsal(scene, replace(anatomy, organ=organ), first.probe)
+    other_anatomy = replace(anatomy, organ=organ)
+    scene = with_options(first.case.scene, {"tissue.cell_mm": 7.0})
+    other = Rehearsal(case_of(scene, other_anatomy, first.case.probe), other_anatomy)
     used(other)
-    assert other.body.count != first.body.count and other.embedding.count != first.embedding.count
+    assert other.organ.body.count != first.organ.body.count
+    assert other.anatomy.embedding.count != first.anatomy.embedding.count
     assert compiled == []

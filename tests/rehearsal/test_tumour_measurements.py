@@ -1,4 +1,4 @@
-"""The measurements of a rehearsal: a ball in a ball, and outlines whose place in the picture is known by hand."""
+"""The measurements of an anatomy: a ball in a ball, and outlines whose place in the picture is known by hand."""
 
 from types import SimpleNamespace
 
@@ -7,10 +7,7 @@ import pytest
 import trimesh
 
 from rehearsal.measurements.tumour_measurements import measure
-from sim.fields import field_of
 from ultrasound.probe import load_probe
-
-pytestmark = pytest.mark.usefixtures("one_device")
 
 LINEAR, CURVED = load_probe("linear"), load_probe("curvilinear")
 NOWHERE = np.zeros((0, 2, 2))
@@ -27,27 +24,26 @@ def posed(face=(0.0, 0.0, 40.0), probe=LINEAR) -> np.ndarray:
     return pose
 
 
-def rehearsed(
+def anatomy_of(
     organ=None, tumour=None, shift=(0, 0, 0), now=None, pose=None, probe=LINEAR, outline=NOWHERE, wrench=None
 ) -> SimpleNamespace:
-    """The part of a rehearsal that is measured: an organ at rest, or deformed as ``now``, and a tumour that has shifted."""
+    """What is measured of an anatomy: an organ at rest, or deformed as ``now``, and a tumour that has shifted."""
     organ = organ or ball(30.0)
-    lies = np.asarray(organ.vertices if now is None else now, np.float32)
     return SimpleNamespace(
+        case=SimpleNamespace(size_mm=np.array(probe.housing_mm)),
         organ=organ,
-        organ_skin=SimpleNamespace(vertices=field_of(lies, 1)),
+        vertices=np.asarray(organ.vertices if now is None else now, float),
         pose=posed() if pose is None else pose,
-        size_mm=np.array(probe.housing_mm),
         tumour=tumour,
-        wrench=lambda: wrench,
-        tumour_vertices=lambda: np.asarray(tumour.vertices) + shift,
+        frame=SimpleNamespace(wrench=wrench),
+        tumour_vertices=None if tumour is None else np.asarray(tumour.vertices) + shift,
         tumour_outline=lambda: None if tumour is None else outline,
     )
 
 
 def reading(probe=LINEAR, touches=None, **parts):
     every = np.ones(probe.number_of_scanlines, bool)
-    return measure(rehearsed(probe=probe, **parts), probe, every if touches is None else touches)
+    return measure(anatomy_of(probe=probe, **parts), probe, every if touches is None else touches)
 
 
 def test_without_a_tumour_there_is_nothing_to_say_of_it():

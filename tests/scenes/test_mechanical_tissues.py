@@ -8,6 +8,7 @@ import trimesh
 from pydantic import ValidationError
 from small_bead_case import briefly, small_anatomy
 
+from rehearsal.case import case_of
 from rehearsal.pressed_organ import PressedOrgan, parts_of
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.mechanical_tissues import TABLE, MechanicalProperties, mechanical_properties
@@ -55,18 +56,18 @@ def scene_with(**parts: dict) -> Scene:
 
 def test_what_a_part_leaves_out_is_typical_of_it():
     cyst = trimesh.creation.icosphere(subdivisions=2, radius=3.0).apply_translation([8, 0, 0])
-    origin = np.array([1.0, 2.0, 3.0])
-    scene = scene_with(tumour=dict(young_kpa=60.0), cyst={})
-    first, second = parts_of(scene, patient(cyst=cyst), origin)
+    scene, moved = scene_with(tumour=dict(young_kpa=60.0), cyst={}), patient(cyst=cyst)
+    moved.organ.apply_translation([1.0, 2.0, 3.0])
+    first, second = parts_of(case_of(scene, moved))
     # In the order in which the later one counts.
     assert first.material == Material(0.3, 0.499, 1.01) and second.material == Material(60.0, 0.45, 1.05)
     assert first.surface.center_mass == pytest.approx([7.0, -2.0, -3.0], abs=1e-9)
     with pytest.raises(SceneError, match=r"tissue\.parts\.cyst: this patient has no cyst"):
-        parts_of(scene, patient(), origin)
+        parts_of(case_of(scene, patient()))
 
 
 def test_a_scene_without_parts_is_uniform(device):
-    organ = PressedOrgan(scene_with(), patient())
+    organ = PressedOrgan(case_of(scene_with(), patient()))
     assert not organ.model.has_parts and organ.model.history == {} and not organ.model.has_capsule
 
 
@@ -74,15 +75,19 @@ def test_parts_capsule_and_relaxation_reach_the_solver_and_the_state_at_rest(dev
     plain = scene_with()
     full = scene_with(tumour={}).model_dump()
     full["tissue"] |= dict(capsule_n_mm=0.5, prony=[dict(modulus_ratio=0.5, time_s=1.0)])
-    organ = PressedOrgan(Scene.model_validate(full), patient())
+    organ = PressedOrgan(case_of(Scene.model_validate(full), patient()))
     model = organ.model
     assert model.has_parts and model.has_capsule and model.has_relaxation
     assert model.parts == (Material(60.0, 0.45, 1.05),)
     organ.settle()
-    assert set(organ.snapshot_of_organ().solver.history) >= {"elastic_stress", "overstress"}
-    assert np.abs(organ.snapshot_of_organ().solver.history["overstress"]).max() == 0
+    assert set(organ.snapshot().solver.history) >= {"elastic_stress", "overstress"}
+    assert np.abs(organ.snapshot().solver.history["overstress"]).max() == 0
     keys = [
-        tuple(repr(each) for each in PressedOrgan(scene, patient())._inputs() if not hasattr(each, "faces"))
+        tuple(
+            repr(each)
+            for each in PressedOrgan(case_of(scene, patient()))._inputs()
+            if not hasattr(each, "faces")
+        )
         for scene in (plain, scene_with(tumour={}), scene_with(tumour=dict(young_kpa=30.0)))
     ]
     assert len(set(keys)) == 3
@@ -90,7 +95,7 @@ def test_parts_capsule_and_relaxation_reach_the_solver_and_the_state_at_rest(dev
 
 def test_the_embedded_patient_with_a_stiff_tumour(device):
     scene = load_scene(STIFF_TUMOUR)
-    organ = PressedOrgan(scene, load_anatomy(scene, STIFF_TUMOUR.parent))
+    organ = PressedOrgan(case_of(scene, load_anatomy(scene, STIFF_TUMOUR.parent)))
     share = organ.model.lattice.share
     volume = share.T @ organ.model.lattice.tissue.sum(axis=1)
     sinus, urine, tumour = (part.surface.volume for part in organ.parts_of_tissue)
@@ -107,7 +112,7 @@ def test_a_rehearsal_begins_with_tissue_that_has_relaxed(device):
     strains = []
     for values in (dict(cell_mm=4.0), slow):
         tissue = scene.tissue.model_copy(update=values)
-        organ = PressedOrgan(scene.model_copy(update=dict(tissue=tissue)), small_anatomy())
+        organ = PressedOrgan(case_of(scene.model_copy(update=dict(tissue=tissue)), small_anatomy()))
         organ.settle()
         model = organ.model
         corner = array_of(organ.body.position)[model.lattice.cells].astype(float)

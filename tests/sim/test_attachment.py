@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from rehearsal.rehearsal import Rehearsal
+from rehearsal.case import case_of
+from rehearsal.pressed_organ import PressedOrgan
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.patients.patient_scene import hilum
 from scenes.phantom.embedded_patient import phantom_folder
@@ -15,7 +16,7 @@ from sim.sampling import SamplingError
 AT = (-15.0, 0.0, 0.0)
 
 
-def hanging(radius_mm: float, at=AT) -> Rehearsal:
+def hanging(radius_mm: float, at=AT) -> PressedOrgan:
     """A ball without support: without an attachment it falls."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=15.0)
     scene = Scene(
@@ -24,33 +25,31 @@ def hanging(radius_mm: float, at=AT) -> Rehearsal:
         press={"warm_up_steps": 0},
     )
     scene = with_options(scene, {"tissue.cell_mm": 4.0})
-    return Rehearsal(scene, LoadedAnatomy(ball, None, None, ()))
+    return PressedOrgan(case_of(scene, LoadedAnatomy(ball, None, None, ())))
 
 
-def moved_mm(rehearsal: Rehearsal, steps: int = 30) -> np.ndarray:
+def moved_mm(organ: PressedOrgan, steps: int = 30) -> np.ndarray:
     for _ in range(steps):
-        rehearsal.advance(rehearsal.pose)
-    return array_of(rehearsal.body.position) - rehearsal.body.rest_points
+        organ.advance(organ.pose)
+    return array_of(organ.body.position) - organ.body.rest_points
 
 
 def test_fixed_nodes_do_not_move_and_the_rest_hangs_from_them(device):
-    rehearsal = hanging(6.0)
-    moved = moved_mm(rehearsal)
-    held = np.linalg.norm(rehearsal.body.rest_points - AT, axis=1) <= 6.0
+    organ = hanging(6.0)
+    moved = moved_mm(organ)
+    held = np.linalg.norm(organ.body.rest_points - AT, axis=1) <= 6.0
     assert 0 < held.sum() < len(held) / 4
     assert np.abs(moved[held]).max() < 1e-5  # float32 rest positions
-    far = rehearsal.body.rest_points[:, 0] > 8
-    drop = moved[far] @ rehearsal.gravity_direction
+    far = organ.body.rest_points[:, 0] > 8
+    drop = moved[far] @ organ.case.gravity_direction
     # Free fall for 0.5 s would be a metre.
-    assert 0.01 < drop.mean() < 20 and rehearsal.divergence_check.restorations == 0
+    assert 0.01 < drop.mean() < 20 and organ.divergence_check.restorations == 0
 
 
 def test_without_a_radius_no_node_is_fixed(device):
-    rehearsal = hanging(0.0)
-    assert not rehearsal.model.has_fixed
-    assert (
-        moved_mm(rehearsal, 12).min(axis=0)[1] > 100
-    )  # it falls: 12 steps of 1/60 s are 196 mm without damping
+    organ = hanging(0.0)
+    assert not organ.model.has_fixed
+    assert moved_mm(organ, 12).min(axis=0)[1] > 100  # it falls: 12 steps of 1/60 s are 196 mm without damping
 
 
 def test_a_region_with_no_or_all_nodes_is_refused(device):
@@ -73,26 +72,27 @@ def test_a_model_that_cannot_be_attached_starts_without_an_attachment():
         Scene.model_validate(scene.model_dump() | {"tissue": {"model": "shape-matching"}})
 
 
-def spring_scene(**attachment) -> Rehearsal:
+def spring_scene(**attachment) -> PressedOrgan:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=15.0)
     scene = Scene(
         anatomy=AnatomyFiles(),
         attachment=Attachment(**attachment),
         press={"warm_up_steps": 0, "direction": (0, 0, 1), "target_mm": (0, 0, 0)},
     )
-    return Rehearsal(with_options(scene, {"tissue.cell_mm": 3.0}), LoadedAnatomy(ball, None, None, ()))
+    scene = with_options(scene, {"tissue.cell_mm": 3.0})
+    return PressedOrgan(case_of(scene, LoadedAnatomy(ball, None, None, ())))
 
 
-def drop_mm(rehearsal: Rehearsal) -> tuple[float, float]:
+def drop_mm(organ: PressedOrgan) -> tuple[float, float]:
     """How far the centre of mass sinks until it rests, by its springs alone, and the weight [N]."""
-    model = rehearsal.model
-    rehearsal.settings.damping = 60.0
+    model = organ.model
+    organ.settings.damping = 60.0
     for _ in range(400):
-        rehearsal.advance(rehearsal.pose)
+        organ.advance(organ.pose)
     mass = array_of(model.mass)
-    moved = array_of(rehearsal.body.position) - rehearsal.body.rest_points
-    assert np.abs(array_of(rehearsal.body.velocity)).max() < 0.05
-    return float(mass @ moved @ rehearsal.gravity_direction / mass.sum()), 9.81e-3 * float(mass.sum())
+    moved = array_of(organ.body.position) - organ.body.rest_points
+    assert np.abs(array_of(organ.body.velocity)).max() < 0.05
+    return float(mass @ moved @ organ.case.gravity_direction / mass.sum()), 9.81e-3 * float(mass.sum())
 
 
 def test_a_pedicles_tether_stretches_by_the_weight_over_its_stiffness(device):
@@ -104,13 +104,13 @@ def test_a_pedicles_tether_stretches_by_the_weight_over_its_stiffness(device):
 def test_fat_is_a_foundation_on_the_covered_half_of_the_surface(device):
     # On half a ball of radius R and stiffness k per area: 2 pi R^2 k in all. Its springs are in the covered half, which
     # turns the ball a little; the centre of mass sinks by the weight over that stiffness.
-    rehearsal = spring_scene(fat_kpa_mm=0.05)
-    stiffness = array_of(rehearsal.model.tether) / 1e6
+    organ = spring_scene(fat_kpa_mm=0.05)
+    stiffness = array_of(organ.model.tether) / 1e6
     assert stiffness.sum() == pytest.approx(2 * np.pi * 15.0**2 * 0.05e-3, rel=0.03)
     # The transducer comes along +z, so that the fat is on that side of the ball which faces +z.
-    outside = rehearsal.body.rest_points[stiffness > 0]
+    outside = organ.body.rest_points[stiffness > 0]
     assert outside[:, 2].min() > -3.0 and outside[:, 2].max() > 14.0
-    assert drop_mm(rehearsal)[0] > 0.5
+    assert drop_mm(organ)[0] > 0.5
 
 
 def test_an_organ_that_nothing_holds_has_no_springs(device):

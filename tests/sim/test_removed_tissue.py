@@ -1,6 +1,6 @@
 """A ball's lattice, points and membrane after a cut, against the volumes and areas of what remains; restored to the same bits."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import igl
 import numpy as np
@@ -10,9 +10,12 @@ from coarse_patient import coarse_patient
 from cut_ball import R, ball, cut_by, half_space
 from test_lattice import OFFSET, F, most_missing
 
+from rehearsal.case import Case
+from rehearsal.loop.command import BeginAction, Mark, Move, Redo, Undo
+from rehearsal.pressed_organ import PressedOrgan
 from rehearsal.resection.cut import Cut, CutSettings
+from rehearsal.resection.operation import cut_command
 from rehearsal.resection.proposal import marks_around
-from rehearsal.resection.resection_state import NO_RESECTION, CutRequest
 from scenes.surfaces import signed_distance_from
 from sim.fields import array_of
 from sim.lattice import (
@@ -221,9 +224,9 @@ def test_a_cut_with_faces_without_area_gives_points_that_are_numbers(tissue):
     assert np.isfinite(points).all() and area.sum() == pytest.approx(new.area, rel=1e-9)
 
 
-def patient_fields(rehearsal) -> dict[str, np.ndarray]:
+def patient_fields(organ: PressedOrgan) -> dict[str, np.ndarray]:
     """All that a cut changes on the device."""
-    model, contacts = rehearsal.model, rehearsal.contacts
+    model, contacts = organ.model, organ.contacts
     found = {
         name: array_of(getattr(model, name))
         for name in ("gradient", "hourglass", "shear", "mass", "tether")
@@ -239,22 +242,20 @@ def patient(one_device):
     return coarse_patient()[0]
 
 
-def patient_cut(rehearsal) -> Cut:
-    whole = rehearsal.whole_organ
-    middle = rehearsal.whole_tumour.center_mass
-    cutter = trimesh.creation.icosphere(subdivisions=3, radius=16.0).apply_translation(middle)
-    made = cut_by(whole, cutter)
+def patient_cut(case: Case) -> Cut:
+    cutter = trimesh.creation.icosphere(subdivisions=3, radius=16.0)
+    made = cut_by(case.organ, cutter.apply_translation(case.tumour.center_mass))
     assert made.specimen.body_count == 1
     return made
 
 
 def test_undo_gives_the_same_model_to_the_bit(patient):
-    before = patient_fields(patient)
-    cut = patient_cut(patient)
-    patient.apply_cut(cut)
-    during = patient_fields(patient)
-    patient.apply_cut(None)
-    after = patient_fields(patient)
+    organ = patient.organ
+    before = patient_fields(organ)
+    organ.apply_cut(patient_cut(patient.case))
+    during = patient_fields(organ)
+    organ.apply_cut(None)
+    after = patient_fields(organ)
     changed = {name for name in before if not np.array_equal(before[name], during[name])}
     assert {"gradient", "hourglass", "mass", "contacts.area", "lattice.index_of"} <= changed
     for name, values in before.items():
@@ -264,29 +265,29 @@ def test_undo_gives_the_same_model_to_the_bit(patient):
 def test_the_steps_after_undo_and_redo_give_the_same_bits(patient):
     """Each state is restored as it was, with the friction of its own contact points."""
 
+    case, organ = patient.case, patient.organ
+
     def stepped() -> str:
-        for _ in range(5):
-            patient.advance(patient.pose)
-        return patient.digest()
+        patient.do(*[Move(pose=organ.pose)] * 5)
+        return organ.digest()
 
     patient.reset()
-    whole = patient.snapshot()
     of_whole = stepped()
-    tumour = patient.whole_tumour
-    marks = marks_around(patient.whole_organ, tumour, 5.0, np.array([0.65, -0.75, 0.12]))
-    request = CutRequest.of(
-        CutSettings("wedge"), np.ones(len(tumour.vertices), bool), patient.body.snapshot().position
-    )
-    patient.set_resection(replace(NO_RESECTION.with_marks(marks), cut=request))
+    patient.reset()
+    marks = marks_around(case.organ, case.tumour, 5.0, np.array([0.65, -0.75, 0.12]))
+    cut = cut_command(patient.anatomy, CutSettings("wedge"), None)
+    frame = patient.do(Mark(places_mm=marks.tolist()), cut)
+    assert not frame.notices and frame.geometry.cut is not None
     stepped()
-    after_cut = patient.snapshot()
+    patient.do(BeginAction())
     of_cut = stepped()
-    patient.restore(whole)
-    assert patient.cut is None and stepped() == of_whole
-    patient.restore(after_cut)
-    assert patient.cut is not None and stepped() == of_cut
-    assert np.isfinite(array_of(patient.body.position)).all()
-    assert patient.divergence_check.restorations == 0
+    # To before the marks, and back to where the last action began.
+    patient.do(*[Undo()] * 3)
+    assert patient.anatomy.cut is None and stepped() == of_whole
+    patient.do(*[Redo()] * 2)
+    assert patient.anatomy.cut is not None and stepped() == of_cut
+    assert np.isfinite(patient.frame.positions).all()
+    assert organ.divergence_check.restorations == 0
     patient.reset()
     assert stepped() == of_whole
 

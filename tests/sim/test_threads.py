@@ -8,6 +8,7 @@ from coarse_patient import coarse_patient
 from test_rehearsal import LOOK
 from test_solver import position, solver_of
 
+from rehearsal.rehearsal import script_length_s
 from sim import embedding, neo_hookean
 from sim.device import start
 from sim.fields import array_of
@@ -37,13 +38,15 @@ def rehearsed(threads: int) -> str:
     ti.reset()
     start("cpu", cpu_max_num_threads=threads)
     rehearsal = coarse_patient()[0]
-    assert not rehearsal.model.serial
+    case, organ, anatomy = rehearsal.case, rehearsal.organ, rehearsal.anatomy
+    assert not organ.model.serial
     for step in range(20):
-        rehearsal.advance(rehearsal.scripted_pose(step / 20 * rehearsal.script_length_s()))
-    state, wrench = rehearsal.body.snapshot(), rehearsal.wrench()
-    pictures = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK)
-    colour = rehearsal.scanner.doppler(pictures, "colour")
-    arrays = state.position, state.velocity, wrench, *pictures.by_name.values(), colour
+        rehearsal.advance(rehearsal.scripted_pose(step / 20 * script_length_s(case)))
+    rehearsal.show()
+    pictures = anatomy.scanner.images(anatomy.image_plane(), case.probe, *LOOK)
+    colour = anatomy.scanner.doppler(pictures, "colour")
+    state = organ.body.snapshot()
+    arrays = state.position, state.velocity, organ.wrench(), *pictures.by_name.values(), colour
     return hashlib.sha256(b"".join(each.tobytes() for each in arrays)).hexdigest()
 
 

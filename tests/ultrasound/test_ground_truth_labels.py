@@ -1,19 +1,17 @@
 """GroundTruthLabels: what each pixel is, against shapes cut by a plane; and the matrices beside a picture, against the picture."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import trimesh
 from conftest import rotation_about
-from rehearsal.coordinates import probe_in_patient
+from plan_ball import case_of_ball
 
 from sim.embedding import Unmoved
 from sim.fields import fill
 from ultrasound.ground_truth_labels import GroundTruthLabels
 from ultrasound.plane_in_tissue import PlaneInTissue
 from ultrasound.probe import load_probe
-from ultrasound.probe_manipulator import ImagePlane, image_plane, pose_at
+from ultrasound.probe_manipulator import ImagePlane, pose_at
 from ultrasound.sampled_volume import distance_volume
 from ultrasound.scanned_anatomy import ScannedAnatomy
 from ultrasound.scanner import CT, Scanner
@@ -126,38 +124,27 @@ def test_what_no_tissue_holds_is_outside(device):
     assert not GroundTruthLabels(taken(Nowhere()), organ, organ, in_world(0, 25, 0)[None]).render().any()
 
 
-def lying() -> tuple[SimpleNamespace, object]:
-    """What sweeps ask of a rehearsal, with a probe whose picture starts behind its face."""
-    probe = load_probe("curvilinear")
-    pose = pose_at(np.array([9.0, -4, 17]), np.array([0.3, -0.2, -1]), np.array([1, 0.5, 0.2]), 30.0)
-    origin = np.array([-61.0, 112.0, 1240.0])
-    rehearsal = SimpleNamespace(pose=pose, size_mm=np.array(probe.housing_mm), origin=origin)
-    rehearsal.image_plane = lambda: plane_of(rehearsal, probe)
-    return rehearsal, probe
+# A probe whose picture starts behind its face, in a patient.
+CASE = case_of_ball(probe=load_probe("curvilinear"), origin=np.array([-61.0, 112.0, 1240.0]))
+POSE = pose_at(np.array([9.0, -4, 17]), np.array([0.3, -0.2, -1]), np.array([1, 0.5, 0.2]), 30.0)
 
 
-def plane_of(rehearsal, probe) -> ImagePlane:
-    return image_plane(rehearsal.pose, rehearsal.size_mm[2], *probe.extent_mm)
-
-
-def patient_from_pixels(rehearsal, probe, shape) -> np.ndarray:
-    return probe_in_patient(rehearsal) @ probe.image_to_probe(*shape)
+def patient_from_pixels() -> np.ndarray:
+    return CASE.probe_in_patient(POSE) @ CASE.probe.image_to_probe(PIXELS, PIXELS)
 
 
 def test_the_matrices_beside_a_picture_lead_to_where_its_pixels_were_at_rest(device):
-    rehearsal, probe = lying()
     plane = PlaneInTissue(Unmoved(), PIXELS)
-    plane.locate(plane_of(rehearsal, probe))
+    plane.locate(CASE.image_plane(POSE))
     column, row = np.meshgrid(np.arange(PIXELS), np.arange(PIXELS))
     pixels = np.stack([column, row, 0 * row, 1 + 0 * row], axis=-1)
-    places = pixels @ patient_from_pixels(rehearsal, probe, (PIXELS, PIXELS)).T
+    places = pixels @ patient_from_pixels().T
     # Float32 of 150 mm.
-    np.testing.assert_allclose(places[..., :3], plane.rest_grid(PIXELS) + rehearsal.origin, atol=1e-4)
+    np.testing.assert_allclose(places[..., :3], plane.rest_grid(PIXELS) + CASE.origin, atol=1e-4)
 
 
 def test_the_matrices_beside_a_picture_lead_to_what_it_shows(device):
-    rehearsal, probe = lying()
-    shown = patient_from_pixels(rehearsal, probe, (PIXELS, PIXELS))
+    shown = patient_from_pixels()
     # A bright spot in the patient, at a pixel that neither mirror nor transpose leaves in place; a tumour at another.
     spot, tumour = ((shown @ [*at, 0, 1])[:3] for at in ((83, 41), (30, 95)))
     first, voxel = spot - [20, 21, 22], 1.5
@@ -165,13 +152,13 @@ def test_the_matrices_beside_a_picture_lead_to_what_it_shows(device):
     hu = 1000 * np.exp(-((grid - spot) ** 2).sum(axis=-1) / (2 * 4.0**2)) - 1000
     # As a rehearsal has it: all relative to its origin.
     index_from_mm = np.diag([1 / voxel] * 3 + [1.0])
-    index_from_mm[:3, 3] = (rehearsal.origin - first) / voxel
+    index_from_mm[:3, 3] = (CASE.origin - first) / voxel
     organ, mass = (
-        trimesh.creation.icosphere(subdivisions=3, radius=r).apply_translation(tumour - rehearsal.origin)
+        trimesh.creation.icosphere(subdivisions=3, radius=r).apply_translation(tumour - CASE.origin)
         for r in (30.0, 12.0)
     )
-    scanner = Scanner(ScannedAnatomy(organ, hu, index_from_mm, tumour=mass), Unmoved(), probe, PIXELS)
-    images = scanner.images(plane_of(rehearsal, probe), probe, "ct", "speckle", 1000.0, -500.0)
+    scanner = Scanner(ScannedAnatomy(organ, hu, index_from_mm, tumour=mass), Unmoved(), CASE.probe, PIXELS)
+    images = scanner.images(CASE.image_plane(POSE), CASE.probe, "ct", "speckle", 1000.0, -500.0)
     picture = images.by_name[CT].astype(float)
     rows, columns = np.indices(picture.shape)
     light = picture**2
@@ -181,6 +168,6 @@ def test_the_matrices_beside_a_picture_lead_to_what_it_shows(device):
     marks = scanner.ground_truth.render()
     assert columns[marks == PixelLabel.TUMOUR].mean() == pytest.approx(30, abs=0.5)
     assert rows[marks == PixelLabel.TUMOUR].mean() == pytest.approx(95, abs=0.5)
-    width, depth, _ = probe.extent_mm
+    width, depth, _ = CASE.probe.extent_mm
     area = (marks == PixelLabel.TUMOUR).sum() * width * depth / PIXELS**2
     assert area == pytest.approx(np.pi * 12**2, rel=0.06)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from conftest import rotation_about
-from rehearsal.coordinates import probe_in_patient
+from plan_ball import case_of_ball
 
 import app
 from rehearsal.commands.reconstruct_command import _describe, in_words
@@ -57,29 +57,29 @@ def refused(*arguments) -> str:
     return lines[0]
 
 
+ORIGIN = np.array([-61.0, 112.0, 1240.0])
+
+
 def recording(pixels: int = 24) -> tuple[SimpleNamespace, SimpleNamespace]:
-    """What recording asks of a rehearsal and a view; their pictures change with the pose."""
-    probe = load_probe("curvilinear")
+    """What recording asks of an anatomy and a view; their pictures change with the pose."""
+    case = case_of_ball(probe=load_probe("curvilinear"), origin=ORIGIN)
     pose = pose_at(np.array([9.0, -4, 17]), np.array([0.3, -0.2, -1]), np.array([1, 0.5, 0.2]), 30.0)
-    rehearsal = SimpleNamespace(
-        pose=pose, size_mm=np.array(probe.housing_mm), origin=np.array([-61.0, 112.0, 1240.0]), probe=probe
-    )
-    rehearsal.image_plane = lambda: image_plane(rehearsal.pose, rehearsal.size_mm[2], *probe.extent_mm)
     draw = np.random.default_rng(5)
     view = SimpleNamespace(images={"B-mode": draw.integers(0, 256, (pixels, pixels), np.uint8), "CT": None})
     marks = SimpleNamespace(render=lambda: view.images["B-mode"] % 3)
-    rehearsal.scanner = SimpleNamespace(ground_truth=marks)
-    return rehearsal, view
+    anatomy = SimpleNamespace(case=case, pose=pose, scanner=SimpleNamespace(ground_truth=marks))
+    anatomy.probe_in_patient = lambda: case.probe_in_patient(anatomy.pose)
+    return anatomy, view
 
 
 class Recording(SweepRecorder):
     """A recorder whose methods return what they tell the user."""
 
-    def __init__(self, rehearsal: SimpleNamespace) -> None:
-        super().__init__(rehearsal, Notices())
+    def __init__(self, anatomy: SimpleNamespace) -> None:
+        super().__init__(anatomy, Notices())
 
-    def watch(self, *given) -> str:
-        super().watch(*given)
+    def add(self, *given) -> str:
+        super().add(*given)
         return "".join(self.notices.present())
 
     def toggle(self, out: Path) -> str:
@@ -91,33 +91,33 @@ class Recording(SweepRecorder):
         return "".join(self.notices.present())
 
 
-def moved_on(rehearsal: SimpleNamespace, by_mm: float) -> None:
-    rehearsal.pose = rehearsal.pose.copy()
-    rehearsal.pose[:3, 3] += by_mm * rehearsal.pose[:3, 1]
+def moved_on(anatomy: SimpleNamespace, by_mm: float) -> None:
+    anatomy.pose = anatomy.pose.copy()
+    anatomy.pose[:3, 3] += by_mm * anatomy.pose[:3, 1]
 
 
 def test_a_recorded_sweep_gives_the_position_of_each_pixel(tmp_path):
-    rehearsal, view = recording()
-    sweeping, places, pictures = Recording(rehearsal), [], []
-    assert sweeping.watch(0.0, view, rehearsal.probe) == "" and sweeping.stop() == ""
+    anatomy, view = recording()
+    sweeping, places, pictures = Recording(anatomy), [], []
+    assert sweeping.add(0.0, view, anatomy.case.probe) == "" and sweeping.stop() == ""
     assert sweeping.toggle(tmp_path) == "sweep-001: {sweep} ends it"
     for step in range(8):
         # A step of 1/60 s: every other is a frame, the first among them.
-        assert sweeping.watch(5.0 + step / 60, view, rehearsal.probe) == ""
+        assert sweeping.add(5.0 + step / 60, view, anatomy.case.probe) == ""
         if step % 2 == 0:
-            plane = rehearsal.image_plane()
+            plane = anatomy.case.image_plane(anatomy.pose)
             # The middle of the last row but one pixel: on the middle line, a pixel and a half from its end.
             deep = plane.depth_mm * (1 - 1.5 / 24) - plane.above_mm
             aside = plane.width_mm * 0.5 / 24
-            places.append((plane.world_from_plane @ [aside, deep, 0, 1])[:3] + rehearsal.origin)
+            places.append((plane.world_from_plane @ [aside, deep, 0, 1])[:3] + ORIGIN)
             pictures.append(view.images["B-mode"])
-        moved_on(rehearsal, 0.7)
+        moved_on(anatomy, 0.7)
         view.images["B-mode"] = np.roll(view.images["B-mode"], 1, axis=step % 2)
     assert sweeping.toggle(tmp_path) == "sweep-001.igs.mha: 4 images"
     sweep = read_sweep(tmp_path / "sweep-001.igs.mha")
     assert np.array_equal(sweep.images, pictures)
     assert sweep.times_s == pytest.approx(5 + np.arange(4) / 30)
-    assert sweep.transform("Probe", "Reference", 0)[:3, 1] == pytest.approx(-rehearsal.pose[:3, 2])
+    assert sweep.transform("Probe", "Reference", 0)[:3, 1] == pytest.approx(-anatomy.pose[:3, 2])
     for frame, place in enumerate(places):
         at = sweep.transform("Image", "Reference", frame) @ [12, 22, 0, 1]
         assert at[:3] == pytest.approx(place, abs=1e-6)
@@ -128,23 +128,23 @@ def test_a_recorded_sweep_gives_the_position_of_each_pixel(tmp_path):
         frame["ProbeToReferenceTransform"] for frame in sweep.frames
     ]
     assert read_ground_truth(tmp_path / "sweep-001-marks.igs.mha") is None
-    # Times of a sweep are those of the rehearsal, and a new one begins at once, whenever the last ended.
+    # Times of a sweep are those of the session, and a new one begins at once, whenever the last ended.
     assert sweeping.toggle(tmp_path) == "sweep-002: {sweep} ends it"
-    sweeping.watch(1.0, view, rehearsal.probe)
+    sweeping.add(1.0, view, anatomy.case.probe)
     assert sweeping.stop() == "sweep-002.igs.mha: 1 images"
     assert read_sweep(tmp_path / "sweep-002.igs.mha").times_s == [1.0]
 
 
 def test_the_length_of_a_sweep_is_shown_while_it_is_recorded(tmp_path):
-    rehearsal, view = recording()
-    sweeping = Recording(rehearsal)
+    anatomy, view = recording()
+    sweeping = Recording(anatomy)
     said = []
     for first in (100.0, 200.0):
         said.append(sweeping.status)
         sweeping.toggle(tmp_path)
         said.append(sweeping.status)
         for time_s in (first, first + 0.6, first + 11.8):
-            sweeping.watch(time_s, view, rehearsal.probe)
+            sweeping.add(time_s, view, anatomy.case.probe)
             said.append(sweeping.status)
         sweeping.toggle(tmp_path)
     once = ["", *(f"RECORDING {seconds} s" for seconds in (0, 0, 1, 12))]
@@ -163,40 +163,40 @@ def test_sweeps_are_numbered_after_the_last(tmp_path):
 
 
 def test_a_sweep_without_frames_or_ct_leaves_words_and_no_file(tmp_path):
-    rehearsal, _ = recording()
-    sweeping = Recording(rehearsal)
+    anatomy, _ = recording()
+    sweeping = Recording(anatomy)
     sweeping.toggle(tmp_path)
     assert sweeping.stop() == "No sweep: a sweep without frames"
     assert "cannot be written: No such file" in sweeping.toggle(tmp_path / "none")
-    rehearsal.scanner = None
+    anatomy.scanner = None
     assert sweeping.toggle(tmp_path) == "No sweep: the scene has no CT"
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("marks_too", [False, True])
 def test_a_full_disk_ends_a_sweep_in_words_and_leaves_nothing(tmp_path, marks_too, bytes_to_a_file):
-    rehearsal, view = recording(pixels=256)
+    anatomy, view = recording(pixels=256)
     if marks_too:
-        rehearsal.scanner.ground_truth.render = lambda: view.images["B-mode"]
-    sweeping = Recording(rehearsal)
+        anatomy.scanner.ground_truth.render = lambda: view.images["B-mode"]
+    sweeping = Recording(anatomy)
     sweeping.toggle(tmp_path)
     with bytes_to_a_file(150_000):
         # Noise: 65 kB each, of which two have room.
-        said = [sweeping.watch(k / 30, view, rehearsal.probe) for k in range(5)]
+        said = [sweeping.add(k / 30, view, anatomy.case.probe) for k in range(5)]
     assert said == ["", "", f"No sweep: {FULL}", "", ""]
     assert list(tmp_path.iterdir()) == []
     sweeping.toggle(tmp_path)
-    sweeping.watch(0.0, view, rehearsal.probe)
+    sweeping.add(0.0, view, anatomy.case.probe)
     assert sweeping.stop() == "sweep-001.igs.mha: 1 images"
 
 
 def test_a_picture_of_another_size_ends_a_sweep_with_what_there_is(tmp_path):
-    rehearsal, view = recording()
-    sweeping = Recording(rehearsal)
+    anatomy, view = recording()
+    sweeping = Recording(anatomy)
     sweeping.toggle(tmp_path)
-    sweeping.watch(0.0, view, rehearsal.probe)
+    sweeping.add(0.0, view, anatomy.case.probe)
     view.images["B-mode"] = np.zeros((8, 8), np.uint8)
-    said = sweeping.watch(1.0, view, rehearsal.probe)
+    said = sweeping.add(1.0, view, anatomy.case.probe)
     assert said.startswith("sweep-001.igs.mha: 1 images: frame 1: image of uint8 (8, 8)")
     assert len(read_sweep(tmp_path / "sweep-001.igs.mha")) == len(
         read_sweep(tmp_path / "sweep-001-marks.igs.mha")
@@ -204,10 +204,10 @@ def test_a_picture_of_another_size_ends_a_sweep_with_what_there_is(tmp_path):
 
 
 def test_both_files_or_none(tmp_path):
-    rehearsal, view = recording()
-    sweep = LabelledSweep(tmp_path, "s", rehearsal.probe)
+    anatomy, view = recording()
+    sweep = LabelledSweep(tmp_path, "s", anatomy.case.probe)
     picture = view.images["B-mode"]
-    sweep.add(picture, picture % 3, rehearsal.probe, probe_in_patient(rehearsal), 0.0)
+    sweep.add(picture, picture % 3, anatomy.case.probe, anatomy.probe_in_patient(), 0.0)
     # The pictures find a folder where their file should be.
     (tmp_path / "s.igs.mha").mkdir()
     with pytest.raises(IsADirectoryError):
@@ -245,25 +245,28 @@ def test_a_probe_is_held_where_its_image_plane_is():
     )
 
 
-class Still:
-    """What undoing asks of a rehearsal, whose tissue never moves; it remembers how the probe did."""
+def still_rehearsal() -> tuple[SimpleNamespace, list[np.ndarray]]:
+    """What the correction asks of a rehearsal whose tissue never moves, and the poses that its probe takes."""
+    probe = load_probe("curvilinear").model_copy(update=dict(housing_mm=(40.0, 10.0, 20.0)))
+    organ = SimpleNamespace(pose=np.eye(4), settings=SimpleNamespace(time_step_s=1 / 60))
+    poses: list[np.ndarray] = []
 
-    def __init__(self, origin: np.ndarray, length_mm: float) -> None:
-        self.embedding, self.origin, self.size_mm = Unmoved(), origin, np.array([40.0, 10.0, length_mm])
-        self.settings, self.way = SimpleNamespace(time_step_s=1 / 60), []
+    def advance(pose: np.ndarray) -> None:
+        organ.pose = pose
+        poses.append(pose)
 
-    def advance(self, pose: np.ndarray) -> None:
-        self.pose = pose
-        self.way.append(pose)
+    case, anatomy = case_of_ball(probe=probe, origin=ORIGIN), SimpleNamespace(embedding=Unmoved())
+    still = SimpleNamespace(case=case, anatomy=anatomy, organ=organ, advance=advance, show=lambda: None)
+    return still, poses
 
 
 def test_compression_correction_follows_the_tracked_path_and_leaves_tissue_at_rest_in_place(device):
     probe = load_probe("curvilinear")
     on_probe, way = probe.image_to_probe(32, 32), over_tumour()[::5]
     sweep = sweep_of(np.zeros((len(way), 32, 32), np.uint8), way, np.array([0.0, 0.1, 9.0]), on_probe)
-    still = Still(np.array([-61.0, 112.0, 1240.0]), 20.0)
+    still, at = still_rehearsal()
     places = CompressionCorrection(still, sweep, image_poses_of(sweep, "Reference"), "Reference")
-    begun = len(still.way)
+    begun = len(at)
     assert begun == (compression_correction.APPROACH_S + compression_correction.SETTLE_S) * 60
     row, column = np.indices((32, 32))
     pixels = np.stack([column, row, 0 * row, 1 + 0 * row], axis=-1)
@@ -271,19 +274,17 @@ def test_compression_correction_follows_the_tracked_path_and_leaves_tissue_at_re
         # Float32 of 1300 mm, less its origin.
         expected = (pixels @ (pose @ on_probe).T)[..., :3]
         assert places(frame) == pytest.approx(expected, abs=1e-3)
-        face = still.pose @ [0, 0, -10.0, 1]
-        assert face[:3] + still.origin == pytest.approx(pose[:3, 3])
+        face = at[-1] @ [0, 0, -10.0, 1]
+        assert face[:3] + ORIGIN == pytest.approx(pose[:3, 3])
     # 0.1 s, and a pause of 8.9 s cut to 2.
-    assert len(still.way) - begun == 6 + 120
-    assert np.linalg.norm(still.way[0][:3, 3] - still.way[begun - 1][:3, 3]) == pytest.approx(29.0)
+    assert len(at) - begun == 6 + 120
+    assert np.linalg.norm(at[0][:3, 3] - at[begun - 1][:3, 3]) == pytest.approx(29.0)
 
 
 def test_what_no_probe_can_press_again_is_refused(device):
     sweep = sweep_of(np.zeros((1, 32, 30), np.uint8), np.eye(4)[None], np.zeros(1), np.eye(4))
     with pytest.raises(SweepError, match="32 x 30 pixels: expected a sweep that Nephron recorded"):
-        CompressionCorrection(
-            Still(np.zeros(3), 20.0), sweep, image_poses_of(sweep, "Reference"), "Reference"
-        )
+        CompressionCorrection(still_rehearsal()[0], sweep, image_poses_of(sweep, "Reference"), "Reference")
 
 
 @pytest.fixture(scope="module")
