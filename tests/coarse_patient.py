@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rehearsal.case import case_of
 from rehearsal.configuration import probe_of
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import Grid, LoadedAnatomy, load_anatomy
@@ -26,4 +27,4 @@ def coarse_patient() -> tuple[Rehearsal, LoadedAnatomy]:
     anatomy = replace(whole, ct=thinned(whole.ct), labels=thinned(whole.labels))
     few = dict(number_of_scanlines=64, number_of_samples_per_scanline=160)
     probe = probe_of(scene).model_copy(update=few)
-    return Rehearsal(scene.model_copy(update=short | small), anatomy, probe), anatomy
+    return Rehearsal(case_of(scene.model_copy(update=short | small), anatomy, probe), anatomy), anatomy
