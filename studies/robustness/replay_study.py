@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from rehearsal.commands.command_line import arch_option
 from rehearsal.configuration import PRESETS
-from rehearsal.loop.command import Follow
+from rehearsal.loop.command import Checkpoint, Follow
 from rehearsal.notices import Notices
 from rehearsal.real_time.pace import Pace
 from rehearsal.rehearsal import Rehearsal
@@ -100,6 +100,7 @@ def recorded(
                 timeline.apply(command)
         recorder.observe(rehearsal.do())
         bar.update()
+    recorder.observe(rehearsal.do(Checkpoint()))
     recorder.close({})
     return recorder.path, rehearsal.organ.digest()
 
