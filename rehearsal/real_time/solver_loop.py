@@ -12,7 +12,7 @@ import numpy as np
 import sim.device
 from rehearsal.case import Case
 from rehearsal.loop.command import Command, Follow, Move, NewSession, Pause
-from rehearsal.loop.frame import Frame
+from rehearsal.loop.frame import Event, Frame
 from rehearsal.loop.timeline import Timeline
 from rehearsal.pressed_organ import PressedOrgan
 from rehearsal.real_time.pace import MOST_WAIT_S, Pace
@@ -23,8 +23,8 @@ from sim.skinning import Interpolation
 
 # Time by which the simulation may be behind the clock and still catch up; more is lost: slow motion.
 MOST_BEHIND_S = 0.1
-# Of a frame, what is sent through the shared memory.
-APART = "positions", "frames"
+# Of a frame, what is sent apart: arrays through the shared memory, and events, of which none may be left out.
+APART = "positions", "frames", "events"
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,8 @@ class Sent:
 
     write: int
     values: dict[str, Any]
-    applied: int = 0
+    events: tuple[Event, ...]
+    applied: int
 
 
 def compute(connection: Connection, parent: int) -> None:
@@ -180,7 +181,7 @@ class SolverLoop:
         values = {name: value for name, value in vars(frame).items() if name not in APART}
         news = {name: value for name, value in values.items() if self._sent.get(name) is not value}
         self._sent = values
-        self._connection.send(Sent(self._writes, news, self._applied))
+        self._connection.send(Sent(self._writes, news, frame.events, self._applied))
 
 
 def arrays_of(frame: Frame) -> list[np.ndarray]:

@@ -103,10 +103,9 @@ class SolverProcess:
     def _receive_frame(self) -> None:
         sent: Sent = self._receive()
         self._write, self._applied = sent.write, sent.applied
-        events = sent.values.pop("events", ())
-        self._events += events
+        self._events += sent.events
         self._values |= sent.values
-        steps = [event for event in events if isinstance(event, Step)]
+        steps = [event for event in sent.events if isinstance(event, Step)]
         self._last_step = steps[-1] if steps else self._last_step
 
     def _send(self, message: Any) -> None:

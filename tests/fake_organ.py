@@ -1,0 +1,86 @@
+"""An organ of two points whose steps are arithmetic: all that a timeline needs of a ``PressedOrgan``, in microseconds."""
+
+import hashlib
+from types import SimpleNamespace
+
+import numpy as np
+
+from rehearsal.loop.timeline import Timeline
+from rehearsal.pressed_organ import OrganState
+from sim.body import BodyState
+from sim.divergence_check import DivergenceState
+from sim.solver import SolverState, StepSettings
+
+STEP_S = 0.125
+
+
+class FakeOrgan:
+    """Each step depends on all that a step depends on: state, pose, length, iterations, stiffness of the material, the good state."""
+
+    def __init__(self) -> None:
+        self.case = SimpleNamespace(organ=None, tumour=None, parts={})
+        self.settings = StepSettings(time_step_s=STEP_S, iterations=4)
+        self.young_kpa, self.gravity = 15.0, 9.81
+        self.position, self.velocity = np.zeros((2, 3), np.float32), np.ones((2, 3), np.float32)
+        self.friction = np.zeros(2, np.float32)
+        self.pose, self.steps, self.notice, self.cut = np.eye(4), 0, "", None
+        self.model = SimpleNamespace(carrier=SimpleNamespace(interpolation=None))
+        self.divergence_check = SimpleNamespace(set_initial_state=self.store_valid_state)
+        self.store_valid_state()
+
+    @property
+    def body(self) -> SimpleNamespace:
+        return SimpleNamespace(position=SimpleNamespace(memory=self.position))
+
+    def _solver(self) -> SolverState:
+        body = BodyState(self.position.copy(), self.velocity.copy())
+        return SolverState(body, {"friction": self.friction.copy()})
+
+    def store_valid_state(self) -> None:
+        self.divergence = DivergenceState(self._solver())
+
+    def snapshot(self) -> OrganState:
+        return OrganState(self._solver(), self.divergence, self.pose, self.steps)
+
+    def restore(self, state: OrganState) -> None:
+        body = state.solver.body
+        self.position, self.velocity = body.position.copy(), body.velocity.copy()
+        self.friction = state.solver.history["friction"].copy()
+        self.divergence, self.pose, self.steps = state.divergence, state.pose, state.steps
+
+    def timed_step(self, pose, length_s, iterations) -> tuple[float, np.ndarray]:
+        good = self.divergence.good.body.position
+        push = pose[:3, 3] * iterations + self.young_kpa - self.gravity + 0.1 * good + self.friction[:, None]
+        self.velocity = (0.5 * self.velocity + length_s * push).astype(np.float32)
+        self.position = (0.9 * self.position + length_s * self.velocity).astype(np.float32)
+        self.friction += np.float32(iterations * length_s)
+        self.pose, self.steps = pose, self.steps + 1
+        return 1.0, self.wrench()
+
+    def wrench(self) -> np.ndarray:
+        return np.full(6, self.position.sum(), np.float32)
+
+    def digest(self) -> str:
+        arrays = self.position, self.velocity, self.friction, self.divergence.good.body.position
+        return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()[:16]
+
+    def set_young(self, young_kpa: float) -> None:
+        self.young_kpa = young_kpa
+
+    def set_gravity(self, gravity: float) -> None:
+        self.gravity = gravity
+
+    def check_can_be_cut(self) -> None: ...
+    def apply_cut(self, cut) -> None: ...
+
+
+def fake_timeline() -> Timeline:
+    """A timeline at rest."""
+    return Timeline(FakeOrgan())
+
+
+def pose_at(x: float, y: float = 0.0, z: float = 0.0) -> np.ndarray:
+    """A pose (4, 4) at a place."""
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose
