@@ -8,7 +8,7 @@ import numpy as np
 
 from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.loop.command import Move
-from rehearsal.loop.frame import Frame
+from rehearsal.loop.frame import Applied, Frame, Step
 from rehearsal.loop.timeline import periods
 from rehearsal.measurements.session_summary import SessionCourse
 from rehearsal.measurements.tumour_measurements import Measurement, measure
@@ -138,10 +138,11 @@ class LiveMeasurements:
             self.latest = measure(self.anatomy, probe, self._touches)
             self.note(frame.number, self.figures())
             self._show()
-        for step in frame.steps:
-            self.count(step.pose, step.length_s)
-        for _ in frame.restored:
-            self.count(None, 0.0)
+        for event in frame.events:
+            if isinstance(event, Step):
+                self.count(event.pose, event.length_s)
+            elif isinstance(event, Applied) and event.restored is not None:
+                self.count(None, 0.0)
 
     def count(self, pose: np.ndarray | None, length_s: float) -> None:
         """Count a step by its pose (4, 4) and its length [s], or a rollback by None, for the summary."""
