@@ -152,6 +152,10 @@ class Window:
     def running(self) -> bool:
         return not self._quit and (self._window.running if self._visible else True)
 
+    def quit(self) -> None:
+        """Run no longer, as after the user's key."""
+        self._quit = True
+
     def read_controls(self) -> Controls:
         controls = Controls(settings=self.settings)
         now = time.perf_counter()

@@ -8,6 +8,7 @@ import numpy as np
 import psutil
 from scipy.spatial.transform import Rotation
 
+from rehearsal.case import case_of
 from rehearsal.configuration import Setup, scene_of
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy
@@ -15,14 +16,28 @@ from scenes.scene import Scene
 from sim.device import start
 from sim.fields import Field, array_of
 from sim.solver import Solver
+from ultrasound.probe import Probe
 
 
-def build(
-    scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str, with_image: bool = False
-) -> Rehearsal:
-    """A scene's rehearsal at rest, on a freshly started device."""
+def rehearsal_of(scene: Scene, anatomy: LoadedAnatomy) -> Rehearsal:
+    """A scene's rehearsal at rest. Taichi must be initialised."""
+    return Rehearsal(case_of(scene, anatomy), anatomy)
+
+
+def build(scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str) -> Rehearsal:
+    """A scene's rehearsal at rest with a setup, on a freshly started device; without images."""
     start(arch)
-    return Rehearsal(scene_of(scene, setup), anatomy if with_image else replace(anatomy, ct=None))
+    return rehearsal_of(scene_of(scene, setup), without_images(anatomy))
+
+
+def without_images(anatomy: LoadedAnatomy) -> LoadedAnatomy:
+    """The same without its CT, which only images need."""
+    return replace(anatomy, ct=None)
+
+
+def all_scanlines(probe: Probe) -> np.ndarray:
+    """That each scanline of a probe touches the organ (n,), where its contact is not measured."""
+    return np.ones(probe.number_of_scanlines, bool)
 
 
 def memory_of_process_mb() -> float:
@@ -43,9 +58,11 @@ def _bytes_in(owner: Any, seen: set[int]) -> int:
     seen.add(id(owner))
     if isinstance(owner, Field):
         return 4 * math.prod((*owner.shape, *owner.element))
+    if isinstance(owner, dict):
+        return sum(_bytes_in(part, seen) for part in owner.values())
     if isinstance(owner, list | tuple):
         return sum(_bytes_in(part, seen) for part in owner)
-    if type(owner).__module__.startswith(("sim.", "ultrasound.")):
+    if type(owner).__module__.startswith(("sim.", "ultrasound.", "rehearsal.")):
         return sum(_bytes_in(part, seen) for part in vars(owner).values())
     return 0
 

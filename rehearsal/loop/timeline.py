@@ -168,7 +168,6 @@ class Timeline:
             case Mark() | CutOut():
                 self._operate(command)
             case Bookmark():
-                self.organ.store_valid_state()
                 self._keep()
                 self.history = self.history.marked(self.number)
             case Undo():
@@ -298,7 +297,10 @@ class Timeline:
     def _checkpoint(self) -> None:
         """Record the whole state. It also becomes what the divergence check would restore, so that it is recorded once."""
         self.organ.store_valid_state()
-        self._events.append(Checkpointed(self.number, self.whole_state()))
+        state = self.whole_state()
+        if self.number in self._kept:
+            self._kept[self.number] = replace(state, manipulator=self._kept[self.number].manipulator)
+        self._events.append(Checkpointed(self.number, state))
 
     def _begin_session(self, pose: np.ndarray | None) -> None:
         self.number, self.time_s, self.history = 0, 0.0, History()

@@ -72,32 +72,35 @@ def compute(connection: Connection, parent: int) -> None:
     # A step and back loads the kernels, also where the state at rest was stored. The other process is not ready yet.
     organ.advance(organ.pose)
     organ.restore(at_rest)
-    SolverLoop(connection, Timeline(organ), setup.pace).serve()
+    timeline = Timeline(organ)
+    memory = _shared(connection, timeline.frame())
+    if memory is not None:
+        SolverLoop(connection, timeline, setup.pace, memory).serve()
+
+
+def _shared(connection: Connection, frame: Frame) -> SharedTissue | None:
+    """Send the first frame, and have the memory that the other process makes for the arrays of the next ones; None where it ends."""
+    connection.send(frame)
+    name = connection.recv()
+    return None if name is None else SharedTissue(arrays_of(frame), name)
 
 
 class SolverLoop:
     """Applies the commands that come, makes the steps that are due, and sends a frame after each."""
 
-    def __init__(self, connection: Connection, timeline: Timeline, pace: Pace) -> None:
-        self._connection, self._timeline, self._pace = connection, timeline, pace
+    def __init__(self, connection: Connection, timeline: Timeline, pace: Pace, memory: SharedTissue) -> None:
+        self._connection, self._timeline, self._pace, self._memory = connection, timeline, pace, memory
         self._path = PosePath(np.eye(4))
         self._runs = False
         # The clock's times: up to which steps were made, and at which the newest input came.
         self._simulated_s = self._input_at_s = 0.0
         # Those of the steps that are due now.
         self._lengths_s: deque[float] = deque()
-        self._memory: SharedTissue | None = None
         self._writes = self._applied = 0
         self._sent: dict[str, Any] = {}
 
     def serve(self) -> None:
         """Serve until None comes."""
-        frame = self._timeline.frame()
-        self._connection.send(frame)
-        name = self._connection.recv()
-        if name is None:
-            return
-        self._memory = SharedTissue(arrays_of(frame), name)
         while True:
             for command in self._commands():
                 if command is None:
@@ -120,8 +123,6 @@ class SolverLoop:
             return
         if isinstance(command, Pause | Move | NewSession):
             self._runs = False
-        if isinstance(command, Pause):
-            return
         self._timeline.apply(command)
         frame = self._timeline.frame()
         if self._runs and frame.restored:
@@ -174,8 +175,6 @@ class SolverLoop:
 
     def _send(self, frame: Frame) -> None:
         """Write a frame's arrays, then send the rest of it that is not as in the last one."""
-        if self._memory is None:
-            raise RuntimeError("no memory to write to")
         self._writes += 1
         self._memory.write(arrays_of(frame), self._writes)
         values = {name: value for name, value in vars(frame).items() if name not in APART}

@@ -1,12 +1,12 @@
 """One patient of a cohort, in a worker: settled, pressed and planned for."""
 
 from dataclasses import dataclass
-from functools import partial
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
+from rehearsal.loop.command import Move
 from rehearsal.measurements.run_report import Tally
 from rehearsal.measurements.tumour_measurements import measure
 from rehearsal.planning.plan_file import Plan, PlanError
@@ -15,9 +15,8 @@ from rehearsal.planning.sweep_trial import PlanningProblem, Trial
 from rehearsal.planning.trial_workers import TrialHere
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import rounded
-from rehearsal.stopwatch import timed
 from rehearsal.worker_processes import built_once
-from sim.fields import array_of
+from studies.harness import all_scanlines
 
 SPEED_MM_S = 10.0
 # Measured in the press at each depth.
@@ -60,20 +59,17 @@ def run_patient(key: str, problem: PlanningProblem, trials: int) -> PatientResul
 def press(rehearsal: Rehearsal, build_s: float) -> dict[str, Any]:
     """The report of the scripted press from the settled organ, with ``settled_shift_mm`` and ``stages``."""
     rehearsal.reset()
-    rehearsal.update_surfaces()
-    shift = array_of(rehearsal.organ_skin.vertices) - rehearsal.organ.vertices
-    dt, steps = rehearsal.settings.time_step_s, rehearsal.press.stage_steps
-    tally = Tally(build_s)
+    case, anatomy = rehearsal.case, rehearsal.anatomy
+    shift = anatomy.vertices - case.organ.vertices
+    dt, steps = case.scene.solver.time_step_s, case.press.stage_steps
+    tally, touches = Tally(build_s), all_scanlines(case.probe)
     stages: list[dict[str, float | None]] = []
-    touches = np.ones(rehearsal.probe.number_of_scanlines, bool)
-    for stage, depth_mm in enumerate(rehearsal.press.indentations_mm):
+    for stage, depth_mm in enumerate(case.press.indentations_mm):
         for step in range(stage * steps + 1, (stage + 1) * steps + 1):
-            timed(partial(rehearsal.advance, rehearsal.scripted_pose(step * dt)), tally.step_ms)
-            rehearsal.update_surfaces()
-            tally.watch(rehearsal)
+            tally.add(rehearsal, rehearsal.do(Move(pose=rehearsal.scripted_pose(step * dt))))
         if not tally.finite:
             break
-        found = measure(rehearsal, rehearsal.probe, touches)
+        found = measure(anatomy, case.probe, touches)
         measured = {name: rounded(getattr(found, name)) for name in MEASURED}
         stages.append(measured | dict(indentation_mm=depth_mm))
     settled = rounded(np.linalg.norm(shift, axis=1).max())

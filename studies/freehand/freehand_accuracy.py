@@ -22,11 +22,11 @@ from rehearsal.configuration import PRESETS, Setup, scene_of
 from rehearsal.reconstruction.compression_correction import CompressionCorrection
 from rehearsal.reconstruction.patient_comparison import compare_with_surfaces, surfaces_of
 from rehearsal.reconstruction.sweep_volumes import Places, image_poses_of, reconstruct_volumes
-from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import EMBEDDED, Scene, with_options
 from sim.device import start
 from studies.freehand.freehand_sweeps import GroundTruthSweep, pressed, resting, sweep_of
+from studies.harness import rehearsal_of
 from studies.study_options import out_option
 from studies.study_results import finish_axes, text_table, write_results
 from ultrasound.probe import load_probe
@@ -178,7 +178,7 @@ def compression(
     small = with_options(scene_of(scene, setup), {"image.pixels": PIXELS})
     radius_mm = FIXED_MM if scene.attachment.at_mm else 0.0
     fixed = scene.attachment.model_copy(update={"radius_mm": radius_mm, "stiffness_n_mm": 0.0})
-    rehearsal = Rehearsal(small.model_copy(update={"attachment": fixed}), anatomy)
+    rehearsal = rehearsal_of(small.model_copy(update={"attachment": fixed}), anatomy)
     surfaces = surfaces_of(anatomy)
     rows = []
     for depth in _depths(quick):

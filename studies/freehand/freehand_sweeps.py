@@ -4,14 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from rehearsal.coordinates import probe_in_patient
 
+from rehearsal.deformed_anatomy import scanned_anatomy
 from rehearsal.measurements.tumour_measurements import measure
 from rehearsal.reconstruction.compression_correction import approach
-from rehearsal.rehearsal import Rehearsal, scanned_anatomy
+from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy
 from sim.embedding import Unmoved
 from sim.signed_distance import signed_distance
+from studies.harness import all_scanlines
 from ultrasound.bmode import source_of_pixels
 from ultrasound.ground_truth_labels import MAX_BEADS, GroundTruthLabels
 from ultrasound.plane_in_tissue import PlaneInTissue
@@ -74,8 +75,7 @@ def resting(
     marks = _marks(scanner.plane, organ, tumour, beads)
     images = []
     for pose in poses:
-        scanner.embedding.update()
-        scanner.plane.locate(ImagePlane(pose, *probe.extent_mm))
+        scanner.locate(ImagePlane(pose, *probe.extent_mm))
         images.append(marks.render())
     return _truth(np.stack(images), poses, np.arange(len(poses)) / FRAMES_A_SECOND, probe, beads)
 
@@ -96,42 +96,43 @@ def _along(organ: trimesh.Trimesh, probe: Probe, direction: np.ndarray) -> np.nd
 
 def pressed(rehearsal: Rehearsal, depth_mm: float) -> GroundTruthSweep:
     """A sweep of the deforming body over the tumour, at a depth [mm] and along the probe's elevation axis."""
-    if rehearsal.tumour is None or rehearsal.scanner is None:
+    case, anatomy = rehearsal.case, rehearsal.anatomy
+    if case.tumour is None or anatomy.scanner is None:
         raise ValueError("a pressed sweep needs a tumour and a CT")
     rehearsal.reset()
-    probe, path = rehearsal.probe, _path(rehearsal, depth_mm)
-    beads = beads_of(rehearsal.organ, rehearsal.tumour)
-    marks = _marks(rehearsal.scanner.plane, rehearsal.organ, rehearsal.tumour, beads)
-    touches = np.ones(probe.number_of_scanlines, bool)
+    probe, path = case.probe, _path(rehearsal, case.tumour, depth_mm)
+    beads = beads_of(case.organ, case.tumour)
+    marks = _marks(anatomy.scanner.plane, case.organ, case.tumour, beads)
+    touches = all_scanlines(probe)
     approach(rehearsal, path[0])
     images, poses, compression = [], [], []
-    every = round(1 / (FRAMES_A_SECOND * rehearsal.settings.time_step_s))
+    step_s = rehearsal.organ.settings.time_step_s
+    every = round(1 / (FRAMES_A_SECOND * step_s))
     for step, pose in enumerate(path):
         rehearsal.advance(pose)
         if step % every == 0:
-            rehearsal.update_surfaces()
-            rehearsal.embedding.update()
-            rehearsal.scanner.plane.locate(rehearsal.image_plane())
+            rehearsal.show()
+            anatomy.find_plane(probe)
             images.append(marks.render())
-            poses.append(probe_in_patient(rehearsal))
-            compression.append(measure(rehearsal, probe, touches).compression_mm)
-    times = np.arange(len(poses)) * every * rehearsal.settings.time_step_s
-    truth = _truth(np.stack(images), np.stack(poses), times, probe, beads + rehearsal.origin)
+            poses.append(anatomy.probe_in_patient())
+            compression.append(measure(anatomy, probe, touches).compression_mm)
+    times = np.arange(len(poses)) * every * step_s
+    truth = _truth(np.stack(images), np.stack(poses), times, probe, beads + case.origin)
     truth.compression_mm = float(np.mean(compression))
     return truth
 
 
-def _path(rehearsal: Rehearsal, depth_mm: float) -> np.ndarray:
+def _path(rehearsal: Rehearsal, tumour: trimesh.Trimesh, depth_mm: float) -> np.ndarray:
     """Poses (n, 4, 4) of each step over the middle of the tumour, at a depth [mm] under the settled surface."""
-    home = rehearsal.manipulator.home
-    local = (np.asarray(rehearsal.tumour.vertices) - home[:3, 3]) @ home[:3, :3]  # type: ignore[union-attr]
+    manipulator = rehearsal.manipulator
+    home = manipulator.home
+    local = (np.asarray(tumour.vertices) - home[:3, 3]) @ home[:3, :3]
     low, high = local.min(axis=0)[:2], local.max(axis=0)[:2]
-    step_mm = SPEED_MM_S * rehearsal.settings.time_step_s
-    manipulator, poses = rehearsal.manipulator, []
+    step_mm, poses = SPEED_MM_S * rehearsal.organ.settings.time_step_s, []
     for offset in np.arange(low[1] - BESIDE_MM, high[1] + BESIDE_MM, step_mm):
         pose = home.copy()
         pose[:3, 3] += pose[:3, :2] @ [(low[0] + high[0]) / 2, offset]
-        above = touching(pose, rehearsal.size_mm, manipulator.samples, manipulator.radius_mm)
+        above = touching(pose, manipulator.size_mm, manipulator.samples, manipulator.radius_mm)
         poses.append(advanced(above, depth_mm))
     return np.stack(poses)
 

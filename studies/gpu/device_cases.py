@@ -18,7 +18,7 @@ from studies.performance.step_timing import COUNTS, PAPERS, STEPS, blocks
 from studies.performance.tradeoff import EMBEDDED_CASE
 
 if TYPE_CHECKING:
-    from rehearsal.rehearsal import Rehearsal
+    from rehearsal.deformed_anatomy import DeformedAnatomy
     from ultrasound.scanner import PlaneImages
 
 # A press of the embedded patient's beads, shorter than the paper's: what is compared is one device with another.
@@ -98,10 +98,10 @@ def _is_known(values: np.ndarray) -> bool:
 def pictures() -> Iterator[CaseFigures]:
     """The B-mode image of the embedded patient's bent tissue."""
     start_s = perf_counter()
-    rehearsal = _bent()
+    anatomy = _bent()
 
     def image() -> np.ndarray:
-        return _images(rehearsal).by_name["B-mode"]
+        return _images(anatomy).by_name["B-mode"]
 
     yield _repeated("B-mode", start_s, image, PICTURES, rows_columns=list(image().shape))
 
@@ -109,23 +109,23 @@ def pictures() -> Iterator[CaseFigures]:
 def doppler() -> Iterator[CaseFigures]:
     """Colour Doppler over the same image."""
     start_s = perf_counter()
-    rehearsal = _bent()
-    images = _images(rehearsal)
-    image = partial(rehearsal.scanner.doppler, images, "colour")  # type: ignore[union-attr]
+    anatomy = _bent()
+    images = _images(anatomy)
+    image = partial(anatomy.scanner.doppler, images, "colour")  # type: ignore[union-attr]
     yield _repeated("Doppler", start_s, image, PICTURES, rows_columns=list(images.by_name["B-mode"].shape))
 
 
 def frames() -> Iterator[CaseFigures]:
     """A frame of the window with its picture, off-screen, drawn by the Vulkan driver."""
-    from rehearsal.open_window import geometry_of, initial_settings
-
+    from rehearsal.drawn_geometry import drawn_geometry
     from rehearsal.opening import compile_picture
+    from rehearsal.settings import initial_settings
     from render.window import Window
 
     start_s = perf_counter()
-    rehearsal = _bent()
-    view = replace(compile_picture(rehearsal), readouts={})
-    window = Window(geometry_of(rehearsal), initial_settings(rehearsal), visible=False, by_processor=False)
+    anatomy = _bent()
+    view, settings = replace(compile_picture(anatomy), readouts={}), initial_settings(anatomy.case)
+    window = Window(drawn_geometry(anatomy), settings, visible=False, by_processor=False)
 
     def frame() -> np.ndarray:
         window.draw(view)
@@ -150,24 +150,36 @@ def _repeated(
 
 
 @cache
-def _bent() -> "Rehearsal":
-    """The embedded patient with its tissue bent by the same waves on each backend, so that pictures differ by their own computation alone."""
-    from rehearsal.rehearsal import Rehearsal
+def _bent() -> "DeformedAnatomy":
+    """The embedded patient, touched by the transducer, with its tissue bent by waves.
 
-    rehearsal = Rehearsal(*load_patient(EMBEDDED, quality="balanced"), settles=False)
-    state = rehearsal.snapshot_of_organ()
+    They are the same on each backend, so that pictures differ by their own computation alone.
+    """
+    from rehearsal.case import case_of
+    from rehearsal.deformed_anatomy import DeformedAnatomy, scanned_ct
+    from rehearsal.loop.stepper import LocalStepper
+    from rehearsal.loop.timeline import Timeline
+    from rehearsal.pressed_organ import PressedOrgan
+    from rehearsal.rehearsal import begin
+
+    scene, loaded = load_patient(EMBEDDED, quality="balanced")
+    case = case_of(scene, loaded)
+    organ = PressedOrgan(case)
+    anatomy = DeformedAnatomy(case, loaded, organ.model.carrier.interpolation, scanned_ct(case, loaded))
+    state = organ.snapshot()
     body = state.solver.body
     waves = np.sin(2 * np.pi / WAVE_MM * body.position[:, [1, 2, 0]])
     bent = replace(body, position=body.position + np.float32(BEND_MM) * waves.astype(np.float32))
-    rehearsal.take_settled(replace(state, solver=replace(state.solver, body=bent)))
-    return rehearsal
+    organ.restore(replace(state, solver=replace(state.solver, body=bent)))
+    begin(case, anatomy, LocalStepper(Timeline(organ)))
+    return anatomy
 
 
-def _images(rehearsal: "Rehearsal") -> "PlaneImages":
-    image, scanner = rehearsal.scene.image, rehearsal.scanner
+def _images(anatomy: "DeformedAnatomy") -> "PlaneImages":
+    image, scanner = anatomy.case.scene.image, anatomy.scanner
     assert scanner is not None
     shown = image.detail_level, image.window_hu, image.level_hu
-    return scanner.images(rehearsal.image_plane(), rehearsal.probe, "b-mode", *shown)
+    return scanner.images(anatomy.image_plane(), anatomy.case.probe, "b-mode", *shown)
 
 
 def sizes(arch: str) -> Iterator[CaseFigures]:

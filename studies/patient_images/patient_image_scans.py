@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from scipy import ndimage
 
-from rehearsal.rehearsal import scanned_anatomy
+from rehearsal.deformed_anatomy import scanned_anatomy
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
 from sim.embedding import Unmoved

@@ -10,16 +10,18 @@ import numpy as np
 import taichi as ti
 import trimesh
 from matplotlib.figure import Figure
-from rehearsal.frame import image_view
-from rehearsal.open_window import initial_settings, probe_with_settings
 from tqdm import tqdm
 
 from rehearsal.build_solver import build_solver, embedding_cell_mm, static_shape
+from rehearsal.case import case_of
 from rehearsal.commands.command_line import arch_option
-from rehearsal.configuration import PRESETS, Setup
-from rehearsal.measurements.run_report import Tally
-from rehearsal.pressed_organ import material_of
-from rehearsal.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
+from rehearsal.configuration import PRESETS, Setup, scene_of
+from rehearsal.deformed_anatomy import SURROUNDINGS_MM
+from rehearsal.imaging import image_view
+from rehearsal.loop.command import Move
+from rehearsal.pressed_organ import PressedOrgan, material_of
+from rehearsal.rehearsal import Rehearsal
+from rehearsal.settings import initial_settings, probe_with_settings
 from rehearsal.stopwatch import timed
 from render.background_image import BackgroundImage
 from render.window_layout import WindowLayout
@@ -34,14 +36,15 @@ from sim.embedding import Embedding
 from sim.material import Part
 from sim.shape_matching import fill_organ
 from sim.shapes import ConvexTool
+from sim.skinning import Skin
 from sim.solver import Solver
 from sim.taichi_internals import launched_kernels
-from studies.harness import build, memory_mb
+from studies.harness import memory_mb, rehearsal_of
 from studies.study_options import open_study, out_option, scene_argument
 from studies.study_results import finish_axes, table_of, write_results
 from ultrasound.persistence import Persistence
 from ultrasound.probe import DetailLevel, DopplerMode, Mode, Probe
-from ultrasound.probe_manipulator import ImagePlane, advanced, image_plane, pose_at, poses_between, touching
+from ultrasound.probe_manipulator import ImagePlane, advanced, pose_at, poses_between, touching
 from ultrasound.scanned_anatomy import ScannedAnatomy
 from ultrasound.scanner import PlaneImages, Scanner, shows_ct
 
@@ -143,18 +146,17 @@ class FeatureBody:
     """A scene's organ and support, for solvers with different features; positions relative to the organ's middle [mm]."""
 
     def __init__(self, scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str) -> None:
-        rehearsal = build(scene, anatomy, setup, arch)
-        self.tissue, self.settings = rehearsal.scene.tissue, rehearsal.settings
-        self.size_mm, down = rehearsal.size_mm, rehearsal.gravity_direction
+        start(arch)
+        case = case_of(scene_of(scene, setup), anatomy)
+        self.tissue, self.settings = case.scene.tissue, PressedOrgan(case).settings
+        self.size_mm, down = case.size_mm, case.gravity_direction
         side = np.eye(3)[np.abs(down).argmin()]
         pose = pose_at(np.zeros(3), down, side, self.size_mm[2])
-        self.home = touching(pose, self.size_mm, rehearsal.organ.vertices)
-        meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
-        self.supports = [translated(mesh, -rehearsal.origin) for mesh in meshes]
-        organ = rehearsal.organ
-        self.filled = (
-            fill_organ(organ, self.tissue) if isinstance(self.tissue, ShapeMatchingTissue) else organ
-        )
+        self.home = touching(pose, self.size_mm, case.organ.vertices)
+        meshes = [shape for shape in case.shapes if isinstance(shape, trimesh.Trimesh)]
+        self.supports = [translated(mesh, -case.origin) for mesh in meshes]
+        is_filled = isinstance(self.tissue, ShapeMatchingTissue)
+        self.filled = fill_organ(case.organ, self.tissue) if is_filled else case.organ
 
     def solver(self, options: Options, serial: bool | None = None) -> Solver:
         """A solver with some features."""
@@ -242,24 +244,25 @@ def kernels_of(body: FeatureBody, options: Options, arch: str) -> dict[str, int]
 def of_frame(scene: Scene, anatomy: LoadedAnatomy, arch: str) -> Iterator[dict[str, Any]]:
     """The other parts of a frame, each by itself: divergence check, surfaces and image."""
     start(arch)
-    rehearsal = Rehearsal(scene, anatomy)
-    check, dt = rehearsal.divergence_check, rehearsal.settings.time_step_s
-    yield _alone("divergence check", lambda: check.check(dt), [check], rehearsal.solver)
-    yield _alone("organ's surface", rehearsal.organ_skin.update, [rehearsal.organ_skin], rehearsal.model)
-    if (tumour := rehearsal.tumour_skin) is not None:
-        yield _alone("tumour's surface", tumour.update, [tumour], rehearsal.model)
-    if anatomy.ct is None:
-        return
-    draws = scene.image.atlas
-    scanned = scanned_anatomy(rehearsal.organ, anatomy.ct, anatomy, rehearsal.origin, draws)
-    yield from _images(rehearsal, scanned)
-    yield _whole_frame(rehearsal)
+    rehearsal = rehearsal_of(scene, anatomy)
+    case, organ = rehearsal.case, rehearsal.organ
+    check, dt = organ.divergence_check, organ.settings.time_step_s
+    yield _alone("divergence check", lambda: check.check(dt), [check], organ.solver)
+    for name, surface in (("organ", case.organ), ("tumour", case.tumour)):
+        if surface is not None:
+            skin = Skin(organ.model.carrier, surface.vertices)
+            yield _alone(f"{name}'s surface", skin.update, [skin], organ.model)
+    scanner = rehearsal.anatomy.scanner
+    if scanner is not None:
+        yield from _images(rehearsal, scanner.volumes.anatomy)
+        yield _whole_frame(rehearsal)
 
 
 def _images(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[str, Any]]:
     """The image at each detail level, each with all that it needs."""
-    image, probe = rehearsal.scene.image, rehearsal.probe
-    plane = image_plane(rehearsal.pose_at_depth(1.0), probe.housing_mm[2], *probe.extent_mm)
+    case, model = rehearsal.case, rehearsal.organ.model
+    image, probe = case.scene.image, case.probe
+    plane = case.image_plane(rehearsal.pose_at_depth(1.0))
     levels: tuple[tuple[str, str, Mode, DetailLevel], ...] = (
         ("CT, organ alone", "gel", "ct", "speckle"),
         ("CT", "background", "ct", "speckle"),
@@ -269,18 +272,18 @@ def _images(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[str,
         ("B-mode: through fluid", "fluid", "b-mode", "speckle"),
         ("B-mode and CT", "background", "both", "speckle"),
     )
-    cell = embedding_cell_mm(rehearsal.scene.tissue)
+    cell = embedding_cell_mm(case.scene.tissue)
     for name, outside, mode, detail_level in levels:
         margin = SURROUNDINGS_MM if shows_ct(outside) else 0.0
-        embedding = Embedding(rehearsal.model.carrier, rehearsal.organ, cell, margin)
+        embedding = Embedding(model.carrier, case.organ, cell, margin)
         scanner = Scanner(scanned, embedding, probe, image.pixels, outside)
 
         def draw() -> None:
             scanner.images(plane, probe, mode, detail_level, image.window_hu, image.level_hu)
 
-        yield _alone(f"image, {name}", draw, [embedding, scanner], rehearsal.model)
+        yield _alone(f"image, {name}", draw, [embedding, scanner], model)
         if name == "B-mode: and elevation":
-            yield from _switches(scanner, plane, probe, image, rehearsal.model)
+            yield from _switches(scanner, plane, probe, image, model)
 
 
 def _switches(
@@ -311,22 +314,17 @@ def _switches(
 def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
     """A whole frame but the 3D view: a step in a press, surfaces, B-mode and the composed window."""
     rehearsal.reset()
-    settings, tally, page = initial_settings(rehearsal), Tally(0.0), BackgroundImage(WindowLayout(1280, 720))
+    case, page = rehearsal.case, BackgroundImage(WindowLayout(1280, 720))
+    settings = initial_settings(case)
     settings.mode = "b-mode"
-    poses = [
-        rehearsal.pose_at_depth(depth)
-        for depth in np.linspace(0.0, rehearsal.press.indentations_mm[0], CALLS + 1)
-    ]
-
-    whole = [rehearsal.solver, rehearsal.divergence_check, rehearsal.organ_skin, rehearsal.tumour_skin]
-    whole += [rehearsal.embedding, rehearsal.scanner]
+    depths = iter(np.linspace(0.0, case.press.indentations_mm[0], CALLS + 1))
 
     def compute_frame() -> None:
-        rehearsal.advance(poses.pop(0))
-        rehearsal.update_surfaces()
-        probe = probe_with_settings(rehearsal.probe, settings)
-        page.compose(image_view(rehearsal, probe, settings, tally), np.eye(3), slow_figures=True)
+        rehearsal.do(Move(pose=rehearsal.pose_at_depth(next(depths))))
+        probe = probe_with_settings(case.probe, settings)
+        page.compose(image_view(rehearsal.anatomy, probe, settings), np.eye(3), slow_figures=True)
 
+    whole = [rehearsal.organ, rehearsal.anatomy]
     return _alone("whole frame, with B-mode", compute_frame, whole, None)
 
 

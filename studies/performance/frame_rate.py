@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any
@@ -23,17 +24,17 @@ from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.real_time.start_times import StartTimes
 from rehearsal.real_time.started_process import started_process
 from render.display import display_available
-from render.viewer import Controls, View
+from render.viewer import Controls
 from render.vulkan_device import vulkan_devices
 from scenes.scene import EMBEDDED
 from studies.study_results import write_results
 from version import VERSION
 
 if TYPE_CHECKING:
-    from rehearsal.frame import WindowFrames
-
-    from rehearsal.pressed_organ import Step
+    from rehearsal.loop.command import Command
+    from rehearsal.loop.frame import Frame, Step
     from rehearsal.run import RehearsalRun
+    from rehearsal.window_loop import WindowLoop
 
 # The scripted hand presses for a part of each period, while it drags the probe to and fro over the organ.
 PRESS_PERIOD_S, PRESS_S = 3.0, 1.8
@@ -58,70 +59,62 @@ class FrameOptions(ImageOptions, QualityOptions, ArchOptions):
 
 
 class ScriptedHand:
-    """The window of some frames, in which a script moves the probe by the clock; it closes after some seconds.
+    """A ``Source``: a script moves the probe by the clock in the user's stead, and quits after some seconds.
 
-    ``times`` are those of the frames after BEGIN_S, of the last ones in a long run; ``load`` is the processor time that the processes have
-    used since then, a second, and ``memory_mb`` what they have had, every MEMORY_EVERY_S.
+    ``times`` are those of the frames after BEGIN_S, of the last ones in a long run; ``load`` is the processor time
+    that the processes have used since then, a second, and ``memory_mb`` what they have had, every MEMORY_EVERY_S.
+    ``home`` (4, 4) is the transducer's pose where it just touches the organ.
     """
 
-    def __init__(self, frames: "WindowFrames", start: StartTimes, seconds: float) -> None:
-        self.frames, self.window, self.start, self.seconds = frames, frames.viewer, start, seconds
+    def __init__(self, loop: "WindowLoop", home: np.ndarray, start: StartTimes, seconds: float) -> None:
+        self.loop, self.start, self.seconds = loop, start, seconds
         self.first_picture_s = 0.0
         self.times = FrameTimes()
         self.load = 0.0
         self.memory_mb: list[float] = []
+        self._user, self._home = loop.source, home
         self._began_s = 0.0
         self._used_s: float | None = None
-        self._home = frames.rehearsal.manipulator.home
 
     @property
-    def running(self) -> bool:
-        runs = self.window.running and self._passed_s <= BEGIN_S + self.seconds
-        if not runs and self._used_s is not None:
+    def status(self) -> str:
+        """As ``Source.status``."""
+        return self._user.status
+
+    def commands(self, frame: "Frame", controls: Controls, elapsed_s: float) -> "Iterable[Command]":
+        """As ``Source.commands``: the user's, with the script's ray and press."""
+        self._measure()
+        now_s, home = self._passed_s, self._home
+        face = home[:3, 3] - self.loop.anatomy.case.size_mm[2] / 2 * home[:3, 2]
+        aside = DRAG_MM * np.sin(2 * np.pi * now_s / DRAG_PERIOD_S) * home[:3, 0]
+        ray = face + aside + FROM_MM * home[:3, 2], -home[:3, 2]
+        led = replace(controls, ray=ray, press=now_s % PRESS_PERIOD_S < PRESS_S)
+        return self._user.commands(frame, led, elapsed_s)
+
+    def end(self) -> None:
+        """Note the load so far, and quit. A second call does nothing."""
+        if self._used_s is not None and self.load == 0.0:
             self.load = (self._used() - self._used_s) / (self._passed_s - BEGIN_S)
-        return runs
+        self.loop.window.quit()
 
     @property
     def _passed_s(self) -> float:
+        """Time since the first picture."""
         return perf_counter() - self._began_s if self._began_s else 0.0
 
-    def read_controls(self) -> Controls:
-        """The window's controls, with the script's ray and press."""
-        controls, now_s = self.window.read_controls(), self._passed_s
-        face = self._home[:3, 3] - self.frames.rehearsal.size_mm[2] / 2 * self._home[:3, 2]
-        aside = DRAG_MM * np.sin(2 * np.pi * now_s / DRAG_PERIOD_S) * self._home[:3, 0]
-        controls.ray = face + aside + FROM_MM * self._home[:3, 2], -self._home[:3, 2]
-        controls.press = now_s % PRESS_PERIOD_S < PRESS_S
-        return controls
-
-    def image_shape(self, count: int, width_mm: float, depth_mm: float) -> tuple[int, int]:
-        """Rows and columns of the boxes of the images."""
-        return self.window.image_shape(count, width_mm, depth_mm)
-
-    def draw_scene(self, view: View, may_wait: bool) -> None:
-        """Draw the 3D view ahead."""
-        self.window.draw_scene(view, may_wait)
-
-    def draw(self, view: View) -> None:
-        """Draw a view, and measure."""
-        self.window.draw(view)
-        if not self._began_s:
+    def _measure(self) -> None:
+        """Measure what is due after a frame."""
+        if not self._began_s and self.loop.times.ends_s:
             self._began_s = perf_counter()
             self.start.begin("Rehearsal")
             self.first_picture_s = self.start.now_s
-        if self._passed_s > BEGIN_S and self._used_s is None:
-            self._used_s = self._used()
-            self.frames.times = self.times
-        if self._used_s is not None and self._passed_s - BEGIN_S >= MEMORY_EVERY_S * len(self.memory_mb):
+        measured_s = self._passed_s - BEGIN_S
+        if measured_s > 0 and self._used_s is None:
+            self._used_s, self.loop.times = self._used(), self.times
+        if self._used_s is not None and measured_s >= MEMORY_EVERY_S * len(self.memory_mb):
             self.memory_mb.append(sum(each.memory_info().rss for each in self._processes()) / 1e6)
-
-    def picture(self) -> np.ndarray:
-        """The window's picture."""
-        return self.window.picture()
-
-    def close(self) -> None:
-        """Close the window."""
-        self.window.close()
+        if measured_s > self.seconds:
+            self.end()
 
     def _processes(self) -> list[psutil.Process]:
         this = psutil.Process()
@@ -148,21 +141,24 @@ def frames(asked: FrameOptions) -> None:
 
         with opened(RehearseOptions(**shared), process) as run:
 
-            def lead(window_frames: "WindowFrames") -> None:
-                hands.append(ScriptedHand(window_frames, run.start, asked.seconds))
-                window_frames.viewer = hands[0]  # type: ignore[assignment]
+            def lead(loop: "WindowLoop") -> None:
+                hands.append(ScriptedHand(loop, run.manipulator.home, run.start, asked.seconds))
+                loop.source = hands[0]
 
             run.in_window(prepare=lead)
+            # Where the user has closed the window.
+            hands[0].end()
             figures = figures_of(run, hands[0], asked)
     write_results(asked.out, "frames", figures, summary(figures))
 
 
 def figures_of(run: "RehearsalRun", hand: ScriptedHand, asked: FrameOptions) -> dict[str, Any]:
     """The figures of a run; times without the first BEGIN_S."""
-    times, layout, steps = hand.times, hand.window.layout, hand.times.steps
+    times, window, steps = hand.times, hand.loop.window, hand.times.steps
+    layout, settings = window.layout, window.settings
     seconds = times.ends_s[-1][0] - times.ends_s[0][0]
     frames_per_s, real_time_factor = times.rates()
-    settings, scene = run.rehearsal.settings, run.rehearsal.scene
+    scene = run.anatomy.case.scene
     return dict(
         version=VERSION,
         arch=run.arch,

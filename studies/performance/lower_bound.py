@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from rehearsal.rehearsal import Rehearsal
+from rehearsal.rehearsal import Rehearsal, script_length_s
 from rehearsal.stopwatch import timed
 from sim.body import ParticleBody
 from sim.shape_matching import ShapeMatching
@@ -116,14 +116,14 @@ class Pypbd:
 
 def compare(rehearsal: Rehearsal) -> tuple[dict[str, Any], list[str]]:
     """Medians [ms] of the pressed body's step with contacts and of its references, run in turn; the references that are missing."""
-    solver, settings, model = rehearsal.solver, rehearsal.settings, rehearsal.model
+    solver, settings, model = rehearsal.organ.solver, rehearsal.organ.settings, rehearsal.organ.model
     assert isinstance(model, ShapeMatching) and isinstance(model.body, ParticleBody)
     iterations = settings.substeps * settings.iterations
     alone, weightless = (
         Solver(ShapeMatching(model.body, model.patches)),
         replace(settings, gravity=(0.0,) * 3),
     )
-    pose = rehearsal.scripted_pose(rehearsal.script_length_s())
+    pose = rehearsal.scripted_pose(script_length_s(rehearsal.case))
     poses = poses_between(pose, pose, settings.substeps)
     runs: dict[str, Callable[[], None]] = {
         "step_ms": lambda: solver.step(settings, poses),

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from rehearsal.commands.command_line import arch_option
 from rehearsal.configuration import PRESETS, Setup, setup_of
-from rehearsal.rehearsal import Rehearsal
+from rehearsal.rehearsal import Rehearsal, script_length_s
 from rehearsal.result_files import spread
 from rehearsal.stopwatch import timed
 from scenes.scene import PAPER
@@ -129,11 +129,11 @@ def _setups(quick: bool) -> list[Setup]:
 
 def press(rehearsal: Rehearsal, warm_up_steps: int, share: float) -> Iterator[np.ndarray]:
     """Poses of each step, from the stress-free shape: the paper's warm-up, then the scripted press or a share of it."""
-    rehearsal.solver.restart()
-    substeps, script = rehearsal.settings.substeps, rehearsal.script_length_s()
+    rehearsal.organ.solver.restart()
+    substeps, script = rehearsal.organ.settings.substeps, script_length_s(rehearsal.case)
     away = advanced(rehearsal.manipulator.home, -AWAY_MM)
     yield from repeat(poses_between(away, away, substeps), warm_up_steps)
-    steps = max(1, round(share * script / rehearsal.settings.time_step_s))
+    steps = max(1, round(share * script / rehearsal.organ.settings.time_step_s))
     path = [rehearsal.scripted_pose(script * n / steps) for n in range(steps + 1)]
     for first, last in pairwise(path):
         yield poses_between(first, last, substeps)
@@ -141,8 +141,8 @@ def press(rehearsal: Rehearsal, warm_up_steps: int, share: float) -> Iterator[np
 
 def measure(rehearsal: Rehearsal, setup: Setup, share: float, arch: str) -> TimedPress:
     """Press twice: once timed as a whole, once piece by piece; the first step, which compiles, is not timed."""
-    solver, settings, home = rehearsal.solver, rehearsal.settings, rehearsal.manipulator.home
-    warm_up_steps = max(1, round(share * rehearsal.press.warm_up_steps))
+    solver, settings, home = rehearsal.organ.solver, rehearsal.organ.settings, rehearsal.manipulator.home
+    warm_up_steps = max(1, round(share * rehearsal.case.press.warm_up_steps))
     phases = Phases(solver, settings)
     phases.step(poses_between(home, home, settings.substeps))
     step_ms: list[float] = []

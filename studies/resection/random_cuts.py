@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
-from errors import UserError
+from rehearsal.deformed_anatomy import DeformedAnatomy
+from rehearsal.loop.command import Mark
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.cut import Cut
-from rehearsal.resection.resection_state import NO_RESECTION, CutRequest
+from rehearsal.resection.operation import cut_command
 from scenes.surfaces import volume_mm3
-from sim.fields import array_of
 from studies.harness import positions_of
 from studies.resection.random_scores import RandomScore, ScoredPatient, random_score
 
@@ -47,8 +47,6 @@ def random_results(patient: str, rehearsal: Rehearsal, seeds: Sequence[int]) -> 
         rehearsal.reset()
         try:
             yield _result(patient, seed, rehearsal, score)
-        except UserError as error:
-            yield RandomResult(patient, seed, score.kind, refused=str(error))
         except Exception as error:  # any other error is a fault, and the next seeds are tried
             fault = f"{type(error).__name__}: {error}"
             yield RandomResult(patient, seed, score.kind, faults=(fault,))
@@ -56,30 +54,32 @@ def random_results(patient: str, rehearsal: Rehearsal, seeds: Sequence[int]) -> 
 
 def scored_patient(rehearsal: Rehearsal) -> ScoredPatient:
     """The patient whom scores are set on. Its hilum is the middle of the vessels, or the innermost place of the surface."""
-    organ = rehearsal.whole_organ
-    if "vessel" in rehearsal.whole_parts:
-        hilum = np.asarray(rehearsal.whole_parts["vessel"].vertices).mean(axis=0)
+    case = rehearsal.case
+    organ, vessel = case.organ, case.parts.get("vessel")
+    if vessel is not None:
+        hilum = np.asarray(vessel.vertices).mean(axis=0)
     else:
         vertices = np.asarray(organ.vertices)
         hilum = vertices[np.linalg.norm(vertices - organ.center_mass, axis=1).argmin()]
-    return ScoredPatient(organ, rehearsal.whole_tumour, hilum)
+    return ScoredPatient(organ, case.tumour, hilum)
 
 
 def _result(patient: str, seed: int, rehearsal: Rehearsal, score: RandomScore) -> RandomResult:
-    restorations = rehearsal.divergence_check.restorations
-    request = CutRequest.of(score.settings, score.seen, rehearsal.body.snapshot().position)
-    marked = NO_RESECTION.with_marks(score.marks)
-    rehearsal.set_resection(marked)
-    rehearsal.set_resection(type(marked)(marked.marks, request))
-    cut = rehearsal.cut
-    assert cut is not None
-    faults = surface_faults(cut, rehearsal.whole_organ)
+    organ, anatomy = rehearsal.organ, rehearsal.anatomy
+    restorations = organ.divergence_check.restorations
+    cut_out = cut_command(anatomy, score.settings, lambda points: score.seen)
+    frame = rehearsal.do(Mark(places_mm=score.marks.tolist()), cut_out)
+    if anatomy.cut is None:
+        return RandomResult(patient, seed, score.kind, refused=frame.notices[0])
+    cut = anatomy.cut
+    faults = surface_faults(cut, rehearsal.case.organ)
     for _ in range(STEPS):
-        rehearsal.advance(rehearsal.pose)
-    change = volume_change(rehearsal, cut)
-    if not np.isfinite(positions_of(rehearsal.solver)).all():
+        rehearsal.advance(organ.pose)
+    rehearsal.show()
+    change = volume_change(anatomy, cut)
+    if not np.isfinite(positions_of(organ.solver)).all():
         faults.append("positions are not finite")
-    if rehearsal.divergence_check.restorations > restorations:
+    if organ.divergence_check.restorations > restorations:
         faults.append("the divergence check restored a state")
     if not abs(change) <= VOLUME_BAR:
         faults.append(f"remnant and specimen have {100 * change:+.2f} % of the organ's volume")
@@ -108,13 +108,12 @@ def surface_faults(cut: Cut, organ: trimesh.Trimesh) -> list[str]:
     return faults
 
 
-def volume_change(rehearsal: Rehearsal, cut: Cut) -> float:
-    """Relative change of the volume of the remnant as it is now and the specimen as cut together, from the organ's as it was cut."""
-    rehearsal.organ_skin.update()
-    remnant = volume_mm3(array_of(rehearsal.organ_skin.vertices), cut.remnant.faces)
+def volume_change(anatomy: DeformedAnatomy, cut: Cut) -> float:
+    """Relative change of a volume since the cut: that of the whole organ then, and now of remnant and specimen as cut."""
+    remnant = volume_mm3(anatomy.vertices, cut.remnant.faces)
     specimen, organ = (
-        volume_mm3(rehearsal.carried_then(np.asarray(each.vertices)), each.faces)
-        for each in (cut.specimen, rehearsal.whole_organ)
+        volume_mm3(anatomy.carried_then(np.asarray(each.vertices)), each.faces)
+        for each in (cut.specimen, anatomy.case.organ)
     )
     return (remnant + specimen) / organ - 1
 

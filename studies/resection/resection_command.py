@@ -1,7 +1,7 @@
 """The command ``study resection``: margins, balance, random cuts and times of the resection."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +10,11 @@ import numpy as np
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import CommandError, WholeRange, load_patient, make_folder
-from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import rounded
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import EMBEDDED, Scene
 from sim.device import start
+from studies.harness import rehearsal_of, without_images
 from studies.resection.cut_balance import BALANCE_BAR_MM, COARSER_MM, EDGE_MM, balance_rows
 from studies.resection.cut_times import REPEATS, ROUNDS, STEPS, cut_times
 from studies.resection.margin_rows import MARGIN_BAR_MM, VOLUME_BAR, margin_rows
@@ -143,7 +143,7 @@ def _random(patients: Sequence[Patient], seeds: range) -> Part:
     results = []
     for name, scene, anatomy in patients:
         start("cpu")
-        rehearsal = Rehearsal(scene, replace(anatomy, ct=None))
+        rehearsal = rehearsal_of(scene, without_images(anatomy))
         made = random_results(name, rehearsal, seeds)
         results += tqdm(made, desc=f"random scores, {name}", total=len(seeds), unit="score")
     change = [abs(each.volume_change_percent) for each in results if each.volume_change_percent is not None]
@@ -156,7 +156,7 @@ def _times(patients: Sequence[Patient]) -> Part:
     for name, scene, anatomy in patients:
         if anatomy.tumour is not None and anatomy.ct is not None:
             start("cpu")
-            medians[name] = cut_times(Rehearsal(scene, anatomy)).medians()
+            medians[name] = cut_times(rehearsal_of(scene, anatomy)).medians()
     names = list(next(iter(medians.values())))
     table = [[name, *(each[name] for each in medians.values())] for name in names]
     text = (

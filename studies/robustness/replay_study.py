@@ -6,19 +6,21 @@ from typing import Any
 
 import click
 import numpy as np
-from rehearsal.inputs.user_input import UserInput
-from rehearsal.open_window import initial_settings
-from rehearsal.sessions.session import Session
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import arch_option
 from rehearsal.configuration import PRESETS
+from rehearsal.loop.command import Checkpoint, Follow
+from rehearsal.notices import Notices
 from rehearsal.real_time.pace import Pace
 from rehearsal.rehearsal import Rehearsal
-from rehearsal.sessions.recorder import record
-from rehearsal.sessions.replay import Replay
+from rehearsal.sessions.recorder import SessionRecorder, header_of, next_path
+from rehearsal.sessions.replay import Replay, ReplayCheck
 from rehearsal.sessions.session_file import Log, read_log
+from rehearsal.settings import initial_settings
+from rehearsal.sources.user import UserSource
 from render.viewer import Controls
+from scenes.anatomy import LoadedAnatomy
 from scenes.scene import EMBEDDED
 from scenes.tissue import TISSUES, USUAL
 from studies.harness import build
@@ -53,21 +55,10 @@ def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arc
     steps = round(60 * minutes / loaded.solver.time_step_s)
 
     def rehearsal() -> Rehearsal:
-        return build(loaded, anatomy, PRESETS[model][quality], used, with_image=True)
+        return build(loaded, anatomy, PRESETS[model][quality], used)
 
     with tqdm(total=round(3.5 * steps), desc="replay", unit="step") as bar:
-        session = Session(rehearsal())
-        recorded = record(session, anatomy, used, out)
-        live = UserInput(session, recorded)
-        pace, random = Pace(loaded.solver.time_step_s), np.random.default_rng(SEED)
-        for pose in random_poses(live, session.rehearsal, steps, bar):
-            # As on a machine whose load changes.
-            if random.random() < PACE_PROBABILITY:
-                pace.level = int(random.integers(len(pace.levels)))
-            iterations = pace.iterations(session.rehearsal.settings.iterations)
-            live.after_step(session.rehearsal.timed_step(pose, pace.length_s, iterations))
-        recorded.close({})
-        path, digest = recorded.path, session.rehearsal.digest()
+        path, digest = recorded(rehearsal(), anatomy, used, out, steps, bar)
         log = read_log(path)
         runs = [replayed(rehearsal(), log, from_s, bar) for from_s in (0.0, 0.0, log.length_s / 2)]
     figures = dict(
@@ -76,8 +67,8 @@ def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arc
         quality=quality,
         file=path.name,
         minutes=minutes,
-        moments=len(log.poses),
-        ways_back=sum(event.kind == "back" for events in log.events.values() for event in events),
+        moments=log.last_number,
+        ways_back=len(log.restored()),
         megabytes=round(path.stat().st_size / 1e6, 3),
         digest=digest,
         replays=runs,
@@ -85,12 +76,41 @@ def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arc
     write_results(out, "replay", figures, summary(figures))
 
 
-def random_poses(live: UserInput, rehearsal: Rehearsal, steps: int, bar: tqdm) -> Iterator[np.ndarray]:
-    """Poses of a restless user, who also undoes, redoes and resets; the same each time. The step to each is the caller's."""
-    random, settings = np.random.default_rng(SEED), initial_settings(rehearsal)
+def recorded(
+    rehearsal: Rehearsal, anatomy: LoadedAnatomy, arch: str, out: Path, steps: int, bar: tqdm
+) -> tuple[Path, str]:
+    """Record a restless user for so many steps; the session's file, and a hash of the tissue at its end."""
+    case, timeline = rehearsal.case, rehearsal.stepper.timeline
+    step_s, notices = case.scene.solver.time_step_s, Notices()
+    header = header_of(case, anatomy, arch, rehearsal.organ.model.serial, step_s, begins=None)
+    recorder = SessionRecorder(next_path(out), header, notices)
+    user = UserSource(rehearsal.anatomy, rehearsal.manipulator, notices)
+    pace, random = Pace(step_s), np.random.default_rng(SEED)
+    for controls in restless_controls(rehearsal, steps):
+        for command in user.commands(rehearsal.frame, controls, step_s):
+            if isinstance(command, Follow):
+                # As on a machine whose load changes.
+                if random.random() < PACE_PROBABILITY:
+                    pace.level = int(random.integers(len(pace.levels)))
+                timeline.aim(command)
+                timeline.step(
+                    command.pose, pace.length_s, pace.iterations(rehearsal.organ.settings.iterations)
+                )
+            else:
+                timeline.apply(command)
+        recorder.observe(rehearsal.do())
+        bar.update()
+    recorder.observe(rehearsal.do(Checkpoint()))
+    recorder.close({})
+    return recorder.path, rehearsal.organ.digest()
+
+
+def restless_controls(rehearsal: Rehearsal, steps: int) -> Iterator[Controls]:
+    """The controls of a restless user at each step, who also undoes, redoes and resets; the same each time."""
+    random, settings = np.random.default_rng(SEED), initial_settings(rehearsal.case)
     manipulator = rehearsal.manipulator
-    above = np.flatnonzero(manipulator.normals @ rehearsal.gravity_direction < -0.5)
-    every = round(CHANGE_S / rehearsal.settings.time_step_s)
+    above = np.flatnonzero(manipulator.normals @ rehearsal.case.gravity_direction < -0.5)
+    every = round(CHANGE_S / rehearsal.case.scene.solver.time_step_s)
     lasting: dict[str, Any] = {}
     for step in range(steps):
         controls = Controls(settings)
@@ -108,26 +128,26 @@ def random_poses(live: UserInput, rehearsal: Rehearsal, steps: int, bar: tqdm) -
                 settings.iterations = int(random.integers(3, 7))
         for name, value in lasting.items():
             setattr(controls, name, value)
-        pose = live.next_pose(controls)
-        if pose is not None:
-            yield pose
-        live.after_frame()
-        bar.update()
+        yield controls
 
 
 def replayed(rehearsal: Rehearsal, log: Log, from_s: float, bar: tqdm) -> dict[str, Any]:
     """Compute a session again from the last stored state before a time [s]."""
-    replay = Replay(rehearsal, log)
-    begins = replay.begin_at(from_s)
+    replay, check = Replay(log), ReplayCheck(log, Notices())
+    rehearsal.do(*replay.begin(rehearsal.frame.positions, from_s))
+    begins_s = replay.time_s
     # The steps from there to the time itself are not counted.
-    bar.update(begins - log.step_at(from_s))
-    for _ in replay.go_to(log.length_s):
+    bar.update(-replay.moves_until(log.place_at(from_s)))
+    for commands in replay.until(log.length_s):
+        frame = rehearsal.do(*commands)
+        replay.check(frame)
+        check.observe(frame, rehearsal.case.probe)
         bar.update()
     return dict(
-        begins_s=begins * log.header.time_step_s,
-        digest=rehearsal.digest(),
-        compared=replay.compared,
-        differs_s=replay.differs_s,
+        begins_s=begins_s,
+        digest=rehearsal.organ.digest(),
+        compared=check.compared,
+        differs_s=check.differs_s,
     )
 
 

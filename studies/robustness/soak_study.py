@@ -12,7 +12,8 @@ from tqdm import tqdm
 
 from rehearsal.commands.command_line import WholeRange, arch_option
 from rehearsal.configuration import PRESETS, Setup
-from rehearsal.rehearsal import Rehearsal, RehearsalState
+from rehearsal.pressed_organ import OrganState
+from rehearsal.rehearsal import Rehearsal
 from rehearsal.stopwatch import timed
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import EMBEDDED, Scene
@@ -85,7 +86,8 @@ def run_soak(
 ) -> dict[str, Any]:
     """Figures of each simulated minute of ``minute_s`` [s], and whether replay and reset are identical to the bit."""
     rehearsal = build(scene, anatomy, setup, arch)
-    first, begun = rehearsal.snapshot(), rehearsal.digest()
+    organ = rehearsal.organ
+    first, begun = organ.snapshot(), organ.digest()
 
     def drive(numbers: range) -> list[dict[str, Any]]:
         rows = []
@@ -96,40 +98,40 @@ def run_soak(
 
     replayed = range(max(minutes - REPLAYED_MINUTES, 0), minutes)
     rows = drive(range(replayed.start))
-    snapshot = rehearsal.snapshot()
+    snapshot = organ.snapshot()
     rows += drive(replayed)
-    ended = rehearsal.digest()
-    rehearsal.restore(snapshot)
+    ended = organ.digest()
+    organ.restore(snapshot)
     drive(replayed)
-    again = rehearsal.digest()
-    rehearsal.restore(first)
+    again = organ.digest()
+    organ.restore(first)
     return dict(
         model=setup.model,
         minutes=rows,
         digest=ended,
         replay_equal=ended == again,
-        reset_equal=rehearsal.digest() == begun,
+        reset_equal=organ.digest() == begun,
         fallbacks=sum(row["fallbacks"] for row in rows),
         memory_growth_mb=round(rows[-1]["memory_mb"] - rows[min(1, len(rows) - 1)]["memory_mb"], 3),
     )
 
 
-def _minute(rehearsal: Rehearsal, minute: int, minute_s: float, first: RehearsalState) -> dict[str, Any]:
+def _minute(rehearsal: Rehearsal, minute: int, minute_s: float, first: OrganState) -> dict[str, Any]:
     """One minute of rehearsal, and the distance of the tissue from its first rest position."""
+    organ, fallbacks = rehearsal.organ, 0
     step_ms: list[float] = []
-    fallbacks = 0
     for pose in _poses(rehearsal, minute, minute_s):
         timed(lambda: rehearsal.advance(pose), step_ms)
-        fallbacks += bool(rehearsal.notice)
-    position = positions_of(rehearsal.solver)
+        fallbacks += bool(organ.notice)
+    position = positions_of(organ.solver)
     rest = first.solver.body.position.astype(float)
-    rehearsal.update_surfaces()
+    rehearsal.show()
     return dict(
         minute=minute + 1,
         moved_mm=round(float(np.linalg.norm(position - rest, axis=1).mean()), 6),
         shape_mm=round(float(distances_after_fit(position, rest).mean()), 6),
-        volume_ratio=round(rehearsal.volume_ratio(), 6),
-        tangled=rehearsal.divergence_check.health().tangled,
+        volume_ratio=round(rehearsal.anatomy.volume_ratio(), 6),
+        tangled=organ.divergence_check.health().tangled,
         finite=bool(np.isfinite(position).all()),
         fallbacks=fallbacks,
         ms_median=round(float(np.median(step_ms)), 4),
@@ -140,7 +142,8 @@ def _minute(rehearsal: Rehearsal, minute: int, minute_s: float, first: Rehearsal
 def _poses(rehearsal: Rehearsal, minute: int, minute_s: float) -> Iterator[np.ndarray]:
     """Moves to random goals over and in the organ, the same for the same minute; then away, to rest."""
     random = np.random.default_rng([SEED, minute])
-    home, dt = rehearsal.manipulator.home, rehearsal.settings.time_step_s
+    manipulator, dt = rehearsal.manipulator, rehearsal.organ.settings.time_step_s
+    home = manipulator.home
     for step in range(round(minute_s / dt)):
         if step * dt >= minute_s - REST_S:
             goal = advanced(home, -AWAY_MM)
@@ -149,7 +152,7 @@ def _poses(rehearsal: Rehearsal, minute: int, minute_s: float) -> Iterator[np.nd
             goal[:3, 3] += home[:3, :2] @ (random.uniform(-1, 1, 2) * ASIDE_MM)
             oblique = Rotation.from_rotvec(np.radians(OBLIQUE_DEG) * random.uniform(-1, 1, 3))
             goal[:3, :3] = home[:3, :3] @ oblique.as_matrix()
-        yield rehearsal.pose_towards(goal)
+        yield manipulator.pose_towards(goal, rehearsal.organ.pose, dt)
 
 
 def table(runs: list[dict[str, Any]]) -> str:

@@ -8,7 +8,6 @@ import trimesh
 
 from rehearsal.build_solver import build_solver, step_settings
 from rehearsal.configuration import PRESETS, scene_of, setup_of
-from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import load_anatomy
 from scenes.scene import PAPER, Contact, SolverSection, load_scene
 from scenes.surfaces import volume_mm3
@@ -18,7 +17,7 @@ from sim.neo_hookean import LATTICE_SETTINGS, NeoHookean
 from sim.shapes import ConvexTool, Plane
 from sim.skinning import Skin
 from sim.solver import Solver, StepSettings
-from studies.harness import positions_of
+from studies.harness import positions_of, rehearsal_of, without_images
 from studies.robustness.stress_cases import Subject
 from studies.robustness.stress_motion import AWAY_MM
 from studies.uniform_blocks import block_of_cells, block_of_particles
@@ -113,13 +112,15 @@ def prepared(model: str, subject: Subject) -> Specimen:
 def _kidney(model: str, subject: Subject) -> Specimen:
     scene, setup = load_scene(PAPER), PRESETS[model]["fast"]
     setup = setup.but(**json.loads(subject.tissue or "{}"))
-    rehearsal = Rehearsal(scene_of(scene, setup), replace(load_anatomy(scene, PAPER.parent), ct=None))
+    anatomy = without_images(load_anatomy(scene, PAPER.parent))
+    rehearsal = rehearsal_of(scene_of(scene, setup), anatomy)
     # Recovery is measured from where the tissue has stopped moving.
     away = advanced(rehearsal.manipulator.home, -AWAY_MM)
     for _ in range(SETTLE_STEPS):
         rehearsal.advance(away)
-    home, skin = rehearsal.manipulator.home, rehearsal.organ_skin
-    return Specimen(rehearsal.solver, skin, rehearsal.organ, rehearsal.settings, home)
+    organ, surface = rehearsal.organ, rehearsal.case.organ
+    skin = Skin(organ.model.carrier, surface.vertices)
+    return Specimen(organ.solver, skin, surface, organ.settings, rehearsal.manipulator.home)
 
 
 def _mesh(model: str, subject: Subject) -> trimesh.Trimesh:

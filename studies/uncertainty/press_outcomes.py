@@ -9,6 +9,7 @@ from rehearsal.rehearsal import Rehearsal
 from rehearsal.worker_processes import built_once
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
+from studies.harness import all_scanlines, rehearsal_of
 from studies.uncertainty.unknowns import set_values
 
 # Measured at each depth; those of the tumour only where there is one. Its centroid follows.
@@ -26,28 +27,28 @@ class PressProblem:
 
 def press_outcome(problem: PressProblem, values: dict[str, float]) -> np.ndarray:
     """The quantities and the tumour's centroid (depths, 9) [mm, N] of a press with these values, NaN for what there is not."""
-    return _press(built_once(problem.digest, lambda: Rehearsal(problem.scene, problem.anatomy)), values)
+    return _press(built_once(problem.digest, lambda: rehearsal_of(problem.scene, problem.anatomy)), values)
 
 
 def _press(rehearsal: Rehearsal, values: dict[str, float]) -> np.ndarray:
     """Settle from the stress-free shape, then press stage by stage, to the same poses of the probe for all values."""
     set_values(rehearsal, values)
-    solver, press = rehearsal.solver, rehearsal.press
-    solver.restart()
-    rehearsal.divergence_check.set_initial_state()
-    rehearsal.pose = rehearsal.pose_at_depth(-200.0)
-    rehearsal.come_to_rest()
-    rehearsal.pose = rehearsal.pose_at_depth(0.0)
-    step_s, touches = rehearsal.settings.time_step_s, np.ones(rehearsal.probe.number_of_scanlines, bool)
+    case, organ, anatomy = rehearsal.case, rehearsal.organ, rehearsal.anatomy
+    press, touches = case.press, all_scanlines(case.probe)
+    organ.solver.restart()
+    organ.divergence_check.set_initial_state()
+    organ.pose = rehearsal.pose_at_depth(-200.0)
+    organ.come_to_rest()
+    organ.pose = rehearsal.pose_at_depth(0.0)
+    step_s = organ.settings.time_step_s
     outcomes = []
     for stage in range(len(press.indentations_mm)):
         for step in range(press.stage_steps):
             rehearsal.advance(rehearsal.scripted_pose((stage * press.stage_steps + step + 1) * step_s))
-        rehearsal.update_surfaces()
-        found = measure(rehearsal, rehearsal.probe, touches)
+        rehearsal.show()
+        found = measure(anatomy, case.probe, touches)
         quantities = [getattr(found, name) for name in QUANTITIES]
-        centroid = (
-            np.full(3, np.nan) if rehearsal.tumour is None else rehearsal.tumour_vertices().mean(axis=0)
-        )
+        tumour = anatomy.tumour_vertices
+        centroid = tumour.mean(axis=0) if len(tumour) else np.full(3, np.nan)
         outcomes.append([*(np.nan if q is None else q for q in quantities), *centroid])
     return np.array(outcomes, float)

@@ -6,6 +6,7 @@ from typing import get_args
 
 import numpy as np
 
+from rehearsal.case import case_of
 from rehearsal.pressed_organ import attachments_of, parts_of
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy
@@ -56,7 +57,7 @@ def unknowns_of(scene: Scene, anatomy: LoadedAnatomy) -> list[Unknown]:
         Unknown(f"{PARENCHYMA} modulus", "kPa", *kidney.young_kpa),
         Unknown(f"{PARENCHYMA} Poisson's ratio", "", *kidney.poisson, is_ratio=False),
     ]
-    for part in parts_of(scene, anatomy, np.zeros(3)):
+    for part in parts_of(case_of(scene, anatomy)):
         if part.material.poisson < FLUID_POISSON:
             found.append(Unknown(f"{part.name} modulus", "kPa", *table.parts[part.name].young_kpa))
     if getattr(scene.tissue, "capsule_n_mm", 0) > 0:
@@ -72,7 +73,8 @@ def unknowns_of(scene: Scene, anatomy: LoadedAnatomy) -> list[Unknown]:
 
 def set_values(rehearsal: Rehearsal, values: Mapping[str, float]) -> None:
     """Give a rehearsal values of the parameters, by their names; others stay as they are."""
-    model, tissue = rehearsal.model, rehearsal.scene.tissue
+    case, organ = rehearsal.case, rehearsal.organ
+    model, tissue = organ.model, case.scene.tissue
     assert isinstance(model, NeoHookean) and isinstance(tissue, NeoHookeanTissue)
     parts = [
         Material(
@@ -80,7 +82,7 @@ def set_values(rehearsal: Rehearsal, values: Mapping[str, float]) -> None:
             part.material.poisson,
             part.material.density_g_cm3,
         )
-        for part in rehearsal.parts_of_tissue
+        for part in organ.parts_of_tissue
     ]
     model.set_material(
         values.get(f"{PARENCHYMA} modulus", tissue.young_kpa),
@@ -90,10 +92,10 @@ def set_values(rehearsal: Rehearsal, values: Mapping[str, float]) -> None:
     if "capsule" in values:
         model.capsule.set_stiffness(values["capsule"])
     if "friction" in values:
-        rehearsal.contacts.coefficient = values["friction"]
+        organ.contacts.coefficient = values["friction"]
     if "pedicle" in values or "fat" in values:
         given = {"stiffness_n_mm": "pedicle", "fat_kpa_mm": "fat"}
         changed = {key: values[name] for key, name in given.items() if name in values}
-        attachment = rehearsal.scene.attachment.model_copy(update=changed)
-        _, tethers = attachments_of(attachment, rehearsal.origin, np.array(rehearsal.press.direction))
-        model.set_tether(total_stiffness(tethers, model.lattice, rehearsal.organ))
+        attachment = case.scene.attachment.model_copy(update=changed)
+        _, tethers = attachments_of(attachment, case.origin, np.array(case.press.direction))
+        model.set_tether(total_stiffness(tethers, model.lattice, case.organ))

@@ -5,27 +5,30 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
 from conftest import rotation_about
-from rehearsal.real_time.shared_state import SLOTS, SharedState
 
-from rehearsal.pressed_organ import OrganState, PressedOrgan, Step
+from rehearsal.case import case_of
+from rehearsal.loop.command import Bookmark, Follow, GoTo, Move, NewSession, Pause, SetValues
+from rehearsal.loop.frame import Frame, Step
+from rehearsal.pressed_organ import PressedOrgan
 from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.real_time.pace import BUSY, LEAST_ITERATIONS, SPARE, STEPS_DOWN, STEPS_UP, Pace
 from rehearsal.real_time.pose_path import CATCH_UP, LONGEST_S, PosePath
-from rehearsal.real_time.solver_loop import SolverLoop, SolverSetup
+from rehearsal.real_time.shared_tissue import SLOTS, SharedTissue
+from rehearsal.real_time.solver_loop import Sent, SolverLoop, SolverSetup
 from rehearsal.real_time.solver_process import SolverEnded, SolverProcess
 from rehearsal.real_time.started_process import start_process
 from rehearsal.rehearsal import Rehearsal
+from rehearsal.window_loop import MOST_WAIT_S
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import AnatomyFiles, Attachment, Scene, with_options
 from scenes.tissue import NeoHookeanTissue
 from sim import stored_arrays
-from sim.solver import SolverState, StepSettings
+from sim.solver import StepSettings
 from ultrasound.probe_manipulator import advanced
 
 # A process that makes a step of a small body in less than a millisecond; the machine may be busy.
@@ -44,145 +47,118 @@ def small_rehearsal(floor_mm: float | None = None, **changes: float) -> Rehearsa
     floor = () if floor_mm is None else (trimesh.creation.box([60.0, 60.0, 10.0]),)
     for each in floor:
         each.apply_translation([0.0, 0.0, floor_mm - 20.0])
-    return Rehearsal(scene, LoadedAnatomy(ball, None, None, floor))
+    loaded = LoadedAnatomy(ball, None, None, floor)
+    return Rehearsal(case_of(scene, loaded), loaded)
 
 
 @pytest.fixture(scope="module")
-def reference(one_device) -> PressedOrgan:
+def reference(one_device) -> Rehearsal:
     """The same organ, computed in this process."""
     return small_rehearsal()
 
 
 @pytest.fixture(scope="module")
-def started(one_device) -> Iterator[SolverProcess]:
+def started(reference) -> Iterator[SolverProcess]:
     solver = SolverProcess(start_process())
-    copy = small_rehearsal()
-    anatomy = LoadedAnatomy(trimesh.creation.icosphere(subdivisions=3, radius=15.0), None, None, ())
-    solver.build(SolverSetup(copy.scene, anatomy, copy.probe, "cpu", Pace(1 / RATE)))
-    copy.take_settled(solver.settled())
-    solver.attach(copy)
+    solver.build(SolverSetup(reference.case, "cpu", Pace(1 / RATE)))
+    assert solver.model().counts == reference.organ.model.counts()
+    solver.begin()
+    solver.submit(NewSession(pose=reference.manipulator.pose()))
+    solver.submit(Bookmark())
     yield solver
     solver.close()
 
 
 @pytest.fixture
-def solver(started) -> Iterator[SolverProcess]:
-    """The process, paused and at rest."""
-    started.pause()
-    started.rehearsal.reset()
-    started.hand_over()
-    yield started
-    started.pause()
+def solver(started, reference) -> SolverProcess:
+    """The process, paused and at rest, as the reference is."""
+    started.submit(Pause())
+    started.submit(GoTo(state=0))
+    started.submit(SetValues(values={"young_kpa": 15.0}))
+    started.wait()
+    assert started.newest().pose.tobytes() == reference.manipulator.pose().tobytes()
+    reference.reset()
+    return started
 
 
-def pressing(solver: SolverProcess, steps: int) -> list[tuple[list[Step], str]]:
-    """The steps of each collection and the digest after it, while the probe is pressed in and turned, until so many steps."""
-    collected: list[list[Step]] = [[]]
-    solver.on_step = lambda step: collected[-1].append(step)
-    digests, end_s = [], time.monotonic() + LONGEST_WAIT_S
-    home = solver.rehearsal.pose
-    while sum(map(len, collected)) < steps and time.monotonic() < end_s:
-        collected.append([])
-        solver.collect()
-        digests.append(solver.rehearsal.digest())
-        goal = advanced(home, 4.0 * np.sin(len(collected) / 9) ** 2)
-        solver.go_to(goal, time.perf_counter(), 0.01)
+def follow(pose: np.ndarray, took_s: float = 0.01) -> Follow:
+    return Follow(pose=pose, input_s=time.perf_counter(), took_s=took_s)
+
+
+def pressing(solver: SolverProcess, home: np.ndarray, steps: int) -> list[Frame]:
+    """The frames in which the probe is pressed in and turned, until so many steps."""
+    frames: list[Frame] = []
+    end_s = time.monotonic() + LONGEST_WAIT_S
+    while sum(len(frame.steps) for frame in frames) < steps and time.monotonic() < end_s:
+        frames.append(solver.newest())
+        solver.submit(follow(advanced(home, 4.0 * np.sin(len(frames) / 9) ** 2)))
         time.sleep(0.007)
-    return list(zip(collected[1:], digests, strict=True))
+    return frames
 
 
-def test_each_state_is_of_one_instant_and_has_the_bits_of_the_same_steps_here(solver, reference):
-    reference.restore_organ(solver.rehearsal.snapshot_of_organ())
-    solver.run()
-    frames = pressing(solver, 300)
-    lengths, moved = set(), 0.0
-    for steps, digest in frames:
-        for step in steps:
-            moved = max(moved, float(np.abs(step.pose - reference.pose).max()))
-            reference.timed_step(step.pose, step.length_s, step.iterations)
-            lengths.add(step.length_s)
-        assert reference.digest() == digest
-    assert sum(len(steps) for steps, _ in frames) >= 300 and moved > 0.01
-    assert np.array_equal(reference.pose, solver.rehearsal.pose)
+def test_each_frame_is_of_one_instant_and_has_the_bits_of_the_same_steps_here(solver, reference):
+    home, compared = reference.manipulator.pose(), 0
+    for frame in pressing(solver, home, 300):
+        for step in frame.steps:
+            reference.stepper.timeline.step(step.pose, step.length_s, step.iterations)
+        here = reference.do()
+        assert here.positions.tobytes() == frame.positions.tobytes()
+        assert np.array_equal(here.pose, frame.pose)
+        compared += len(frame.steps)
+    assert compared >= 300
 
 
-def numbered(state: OrganState, number: int, good: SolverState | None = None) -> OrganState:
-    """A state whose positions are its number, and of the same good state or another."""
-    body = replace(state.solver.body, position=np.full_like(state.solver.body.position, number))
-    divergence = replace(state.divergence, good=good or state.divergence.good, steps_since_good=number)
-    pose = np.full((4, 4), float(number))
-    return OrganState(replace(state.solver, body=body), divergence, pose, number)
-
-
-def test_states_in_shared_memory_are_read_whole_or_not_at_all(reference):
-    at_rest = reference.snapshot_of_organ()
-    reader = SharedState(at_rest)
-    writer = SharedState(at_rest, reader.name)
-    good = numbered(at_rest, 77).solver
+def test_arrays_in_shared_memory_are_read_whole_or_not_at_all():
+    like = [np.zeros((7, 3), np.float32), np.zeros((2, 4, 4), np.float32)]
+    reader = SharedTissue(like)
+    writer = SharedTissue(like, reader.name)
     for number in range(1, 8):
-        writer.write(numbered(at_rest, number, good if number >= 5 else None), number)
+        writer.write([np.full_like(array, number) for array in like], number)
         for earlier in range(max(1, number - SLOTS + 1), number + 1):
-            state = reader.read(earlier)
-            assert (state.solver.body.position == earlier).all() and (state.pose == earlier).all()
-            assert state.steps == state.divergence.steps_since_good == earlier
-            wanted = good if earlier >= 5 else at_rest.divergence.good
-            assert np.array_equal(state.divergence.good.body.position, wanted.body.position)
+            assert all((array == earlier).all() for array in reader.read(earlier))
         if number > SLOTS:
             assert reader.read(number - SLOTS) is None
-    # The writer is killed while it writes: the states before are still there, and nobody waits.
+    # The writer is killed while it writes: the arrays before are still there, and nobody waits.
     writer._begun[0] = 8
-    writer._slots[8 % SLOTS][1]["position"][:] = -1.0
-    assert (reader.read(7).solver.body.position == 7).all() and reader.read(5) is None
+    writer._slots[8 % SLOTS][0][:] = -1.0
+    assert (reader.read(7)[0] == 7).all() and reader.read(5) is None
     writer.close()
     reader.close()
 
 
-def test_steps_keep_pace_with_the_clock(solver):
-    made: list[Step] = []
-    solver.on_step = made.append
-    solver.run()
+def test_steps_keep_pace_with_the_clock(solver, reference):
+    solver.submit(follow(reference.manipulator.pose()))
     began = time.perf_counter()
     time.sleep(0.5)
-    solver.pause()
+    solver.submit(Pause())
+    solver.wait()
     passed = time.perf_counter() - began
-    simulated = sum(step.length_s for step in made)
+    steps = solver.newest().steps
     # No faster than the clock; how much slower depends on the machine.
-    assert 0 < simulated <= passed + made[-1].length_s
-    assert all(step.late_ms >= 0 for step in made)
+    assert 0 < sum(step.length_s for step in steps) <= passed + steps[-1].length_s
+    assert all(step.late_ms >= 0 for step in steps)
 
 
-def test_paused_it_makes_no_steps_and_continues_from_what_it_is_handed(solver, reference):
-    solver.run()
-    pressing(solver, 30)
-    solver.pause()
-    before = solver.rehearsal.digest()
+def test_paused_it_makes_no_steps_and_moves_are_made_one_by_one(solver, reference):
+    pressing(solver, reference.manipulator.pose(), 30)
+    solver.submit(Pause())
+    solver.wait()
+    number = solver.newest().number
     time.sleep(0.05)
-    solver.collect()
-    assert solver.rehearsal.digest() == before
+    assert solver.newest().number == number
     # An undo: back to the start, with other settings.
-    solver.rehearsal.reset()
-    solver.rehearsal.set_young(30.0)
-    solver.hand_over()
-    poses = np.stack([advanced(solver.rehearsal.pose, depth) for depth in np.linspace(0.1, 2.0, 8)])
-    lengths = np.linspace(1 / 200, 1 / 20, 8)
-    reference.restore_organ(solver.rehearsal.snapshot_of_organ())
-    reference.set_young(30.0)
-    solver.play(poses, lengths)
-    solver.pause()
-    for pose, length in zip(poses, lengths, strict=True):
-        reference.timed_step(pose, float(length))
-    for each in (solver.rehearsal, reference):
-        each.set_young(15.0)
-    assert solver.pending == 0 and reference.digest() == solver.rehearsal.digest() != before
-
-
-def test_a_state_that_the_check_would_restore_crosses_too(solver):
-    solver.run()
-    pressing(solver, round(1.5 * RATE))
-    solver.pause()
-    state = solver.rehearsal.divergence_check.state
-    # Good states are stored every second: it is not the one at rest any more.
-    assert not np.array_equal(state.good.body.position, solver.rehearsal.settled.solver.body.position)
+    solver.submit(GoTo(state=0))
+    poses = [advanced(reference.manipulator.pose(), depth) for depth in np.linspace(0.1, 2.0, 8)]
+    lengths = np.linspace(1 / 200, 1 / 20, 8).tolist()
+    moves = [Move(pose=pose, length_s=length) for pose, length in zip(poses, lengths, strict=True)]
+    softer = SetValues(values={"young_kpa": 30.0})
+    for command in (softer, *moves):
+        solver.submit(command)
+    solver.wait()
+    frame, here = solver.newest(), reference.do(softer, *moves)
+    reference.do(SetValues(values={"young_kpa": 15.0}))
+    assert len(frame.steps) == 8 and frame.positions.tobytes() == here.positions.tobytes()
+    assert frame.wrench == pytest.approx(here.wrench)
 
 
 def test_the_state_at_rest_is_stored_by_all_that_it_depends_on(one_device, monkeypatch, tmp_path):
@@ -197,10 +173,10 @@ def test_the_state_at_rest_is_stored_by_all_that_it_depends_on(one_device, monke
         return len(steps), rehearsal
 
     def pressed(rehearsal: Rehearsal) -> tuple[str, str]:
-        at_rest = rehearsal.digest()
+        at_rest = rehearsal.organ.digest()
         for depth_mm in (1.0, 2.0, 3.0):
             rehearsal.advance(rehearsal.pose_at_depth(depth_mm))
-        return at_rest, rehearsal.digest()
+        return at_rest, rehearsal.organ.digest()
 
     (made, first), (again, second) = rested(), rested()
     assert (made, again) == (3, 0) and pressed(first) == pressed(second)
@@ -223,7 +199,7 @@ def test_a_process_that_ends_is_an_error_in_words():
     solver = SolverProcess(start_process())
     solver._started.process.kill()
     with pytest.raises(SolverEnded, match=r"the solver's process has ended \(exit status -9\)"):
-        solver.settled()
+        solver.model()
     solver.close()
 
 
@@ -251,36 +227,36 @@ class ClockedLoop(SolverLoop):
     ) -> None:
         self.now_s, self.begun, self.hangs_s = 0.0, [], hangs_s
         monkeypatch.setattr("rehearsal.real_time.solver_loop.perf_counter", lambda: self.now_s)
-        super().__init__(self)
+        pace = Pace(1 / 60)
+        pace.level, pace.watch = level, lambda *_: None
+        super().__init__(self, self, pace, None)
         poses = [np.eye(4) + np.eye(4, k=3) * number for number in range(1, len(inputs_s) + 1)]
-        self.requests = [("go_to", (pose, at_s, 0.0)) for pose, at_s in zip(poses, inputs_s, strict=True)]
+        self.inputs = [Follow(pose=pose, input_s=at_s) for pose, at_s in zip(poses, inputs_s, strict=True)]
         self.times_s = [*inputs_s, end_s, np.inf]
-        self.requests.append(("stop", ()))
-        self.organ = self._memory = self
-        self.settings, self.pace = StepSettings(time_step_s=1 / 60, substeps=1, iterations=4), Pace(1 / 60)
-        self.pose, self.pace.level = np.eye(4), level
-        self.pace.watch = lambda *_: None
-        self.run()
+        self.organ, self.settings = self, StepSettings(time_step_s=1 / 60, substeps=1, iterations=4)
+        self.pose = np.eye(4)
+        self._runs = True
+        self._path.stay(self.pose, 0.0)
         self.serve()
 
     def poll(self, wait_s: float) -> bool:
-        """Whether a request comes within a time."""
+        """Whether an input comes within a time."""
         self.now_s = min(self.now_s + wait_s, max(self.times_s[0], self.now_s))
         return self.now_s >= self.times_s[0]
 
-    def recv(self) -> tuple[str, tuple]:
+    def recv(self) -> Follow | None:
         self.times_s.pop(0)
-        return self.requests.pop(0)
+        return self.inputs.pop(0) if self.inputs else None
 
-    def timed_step(self, pose: np.ndarray, length_s: float, iterations: int) -> Step:
+    def step(self, pose: np.ndarray, length_s: float, iterations: int, *clock) -> Step:
         self.begun.append((self.now_s, round(60 * length_s), pose[0, 3]))
         self.now_s += 0.01 + self.hangs_s
         self.hangs_s = 0.0
-        return Step(pose, length_s, iterations, 10.0)
+        return Step(0, pose, length_s, iterations, 10.0)
 
-    def snapshot_of_organ(self) -> None: ...
-    def write(self, *_) -> None: ...
-    def send(self, step: Step) -> None: ...
+    def aim(self, command: Follow) -> None: ...
+    def frame(self, pace: str) -> None: ...
+    def _send(self, frame: None) -> None: ...
 
 
 def test_a_long_step_is_made_as_soon_as_the_input_comes_and_shows_it(monkeypatch):
@@ -333,31 +309,31 @@ class ScriptedPipe:
         self.now_s = max(self.now_s, min(self.now_s + wait_s, comes_s))
         return self.now_s >= comes_s
 
-    def recv(self) -> Step:
-        return self.steps.pop(0)[1]
+    def recv(self) -> Sent:
+        return Sent(0, {}, (self.steps.pop(0)[1],), 0)
 
-    def send(self, request: tuple) -> None:
-        self.sent.append(request)
+    def send(self, command: Follow) -> None:
+        self.sent.append(command)
 
     def close(self) -> None: ...
 
 
 def collected_at(monkeypatch, steps: list[tuple[float, float, bool]], inputs_s: list[float]) -> list[float]:
-    """When the state of each input was collected; steps are (made at, of the input at, awaited) [s]."""
+    """When the frame of each input was there; steps are (made at, of the input at, awaited) [s]."""
     made = [
-        (at_s, Step(np.eye(4), 1 / 15, 4, 10.0, input_s=of_s, awaited=awaited))
+        (at_s, Step(0, np.eye(4), 1 / 15, 4, 10.0, input_s=of_s, awaited=awaited))
         for at_s, of_s, awaited in steps
     ]
     solver = SolverProcess(start_process())
     solver._started.process.kill()
     solver._connection.close()
     solver._connection = pipe = ScriptedPipe(monkeypatch, made)
-    solver.is_paused = False
+    solver._frame = lambda: None
     times = []
     for input_s in inputs_s:
         pipe.now_s = max(pipe.now_s, input_s)
-        solver.go_to(np.eye(4), input_s, 0.06)
-        solver.collect()
+        solver.submit(Follow(pose=np.eye(4), input_s=input_s, took_s=0.06))
+        solver.newest(MOST_WAIT_S)
         times.append(pipe.now_s)
     solver.close()
     return times

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import app
-from rehearsal.pressed_organ import Step
+from rehearsal.loop.frame import Step
+from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.real_time.start_times import StartTimes
 from render.viewer import Controls, Settings
 from scenes.scene import EMBEDDED, load_scene
-from sim.solver import StepSettings
 from studies.performance import frame_rate
 from studies.performance.frame_rate import (
     BEGIN_S,
@@ -28,45 +28,61 @@ HALF_LENGTH_MM = 3.0
 
 
 class Window:
-    """A window that draws nothing, each frame in 50 ms."""
+    """A window that draws nothing."""
 
-    def __init__(self, clock: list[float]) -> None:
-        self.clock, self.running, self.layout = clock, True, SimpleNamespace(width=1280, height=720)
+    running, layout = True, SimpleNamespace(width=1280, height=720)
+    settings = Settings(iterations=4, substeps=1)
 
-    def read_controls(self) -> Controls:
-        return Controls(Settings())
+    def quit(self) -> None:
+        self.running = False
 
-    def draw(self, view: None) -> None:
-        self.clock[0] += 0.05
+
+class User:
+    """A source that gives the controls themselves."""
+
+    status = "of the user"
+
+    def commands(self, frame: None, controls: Controls, elapsed_s: float) -> list[Controls]:
+        return [controls]
 
 
 @pytest.fixture
-def hand(monkeypatch) -> ScriptedHand:
-    clock = [1000.0]
-    monkeypatch.setattr(frame_rate, "perf_counter", lambda: clock[0])
-    monkeypatch.setattr("rehearsal.real_time.frame_times.perf_counter", lambda: clock[0])
-    rehearsal = SimpleNamespace(
-        manipulator=SimpleNamespace(home=np.eye(4)), size_mm=np.array([16.0, 9.0, 2 * HALF_LENGTH_MM])
-    )
-    return ScriptedHand(SimpleNamespace(rehearsal=rehearsal, viewer=Window(clock)), StartTimes(), 6.0)
+def clock(monkeypatch) -> list[float]:
+    now = [1000.0]
+    monkeypatch.setattr(frame_rate, "perf_counter", lambda: now[0])
+    monkeypatch.setattr("rehearsal.real_time.frame_times.perf_counter", lambda: now[0])
+    return now
 
 
-def led(hand: ScriptedHand) -> list[Controls]:
-    """The controls of all frames, each with three steps of 1/60 s at four fifths of the pace, 80 ms after their input."""
+@pytest.fixture
+def hand(clock) -> ScriptedHand:
+    case = SimpleNamespace(size_mm=np.array([16.0, 9.0, 2 * HALF_LENGTH_MM]), scene=load_scene(EMBEDDED))
+    shown = dict(window=Window(), source=User(), anatomy=SimpleNamespace(case=case), times=FrameTimes())
+    return ScriptedHand(SimpleNamespace(**shown), np.eye(4), StartTimes(), 6.0)
+
+
+def led(hand: ScriptedHand, clock: list[float], most: int = 1000) -> list[Controls]:
+    """The controls of all frames, or at most so many.
+
+    Each frame takes 50 ms, and has three steps of 1/75 s at four fifths of the pace, 80 ms after their input.
+    """
     given = []
-    while hand.running:
-        given.append(hand.read_controls())
-        hand.draw(None)
-        times, now = getattr(hand.frames, "times", None), hand.window.clock[0]
-        if times is not None:
-            times.stages_ms["drawing"].append(50.0)
-            times.steps += [Step(np.eye(4), 1 / 75, 4, 9.0, late_ms=late) for late in (0.0, 1.0, 8.0)]
-            times.end_frame(simulated_s=0.8 * (now - 1000.0), input_s=now - 0.08)
+    while hand.loop.window.running and len(given) < most:
+        given += hand.commands(None, Controls(Settings()), 0.05)
+        clock[0] += 0.05
+        times = hand.loop.times
+        times.stages_ms["drawing"].append(50.0)
+        times.steps += [step_of(1 / 75, late_ms) for late_ms in (0.0, 1.0, 8.0)]
+        times.end_frame(simulated_s=0.8 * (clock[0] - 1000.0), input_s=clock[0] - 0.08)
     return given
 
 
-def test_the_hand_presses_and_drags_over_the_organ(hand):
-    given = led(hand)
+def step_of(length_s: float, late_ms: float = 0.0) -> Step:
+    return Step(0, np.eye(4), length_s, 4, took_ms=9.0, late_ms=late_ms)
+
+
+def test_the_hand_presses_and_drags_over_the_organ(hand, clock):
+    given = led(hand, clock)
     # The first frame ends after 50 ms, where the script begins.
     assert len(given) == pytest.approx((BEGIN_S + 6.0) / 0.05, abs=3)
     places = np.array([controls.ray[0] for controls in given])
@@ -80,11 +96,9 @@ def test_the_hand_presses_and_drags_over_the_organ(hand):
     )
 
 
-def test_the_figures_are_those_of_the_frames_after_the_first_seconds(hand, tmp_path):
-    led(hand)
-    scene = load_scene(EMBEDDED)
-    rehearsal = SimpleNamespace(settings=StepSettings(iterations=4, substeps=1), scene=scene)
-    run = SimpleNamespace(rehearsal=rehearsal, arch="cpu", start=hand.start)
+def test_the_figures_are_those_of_the_frames_after_the_first_seconds(hand, clock, tmp_path):
+    led(hand, clock)
+    run = SimpleNamespace(anatomy=hand.loop.anatomy, arch="cpu", start=hand.start)
     figures = figures_of(run, hand, FrameOptions(out=tmp_path))
     assert figures["frames_per_s"] == pytest.approx(20.0) and figures["real_time_factor"] == pytest.approx(
         0.8
@@ -97,8 +111,24 @@ def test_the_figures_are_those_of_the_frames_after_the_first_seconds(hand, tmp_p
     assert "20.0 a second in a window of 1280 x 720" in summary(figures)
 
 
+def test_a_window_that_the_user_closes_has_figures_until_then(hand, clock, monkeypatch):
+    # A processor without a pause.
+    def times(process: object) -> SimpleNamespace:
+        return SimpleNamespace(user=clock[0], system=0.0)
+
+    monkeypatch.setattr(frame_rate.psutil.Process, "cpu_times", times)
+    led(hand, clock, most=80)
+    assert hand.loop.window.running and hand.load == 0.0 and hand.status == "of the user"
+    hand.end()
+    load = hand.load
+    clock[0] += 60.0
+    hand.end()
+    assert not hand.loop.window.running and hand.load == load >= 0.9
+    assert len(hand.times.ends_s) == pytest.approx((80 * 0.05 - BEGIN_S) / 0.05, abs=3)
+
+
 def test_shares_are_of_the_simulated_time():
-    steps = [Step(np.eye(4), length, 4, 1.0) for length in (1 / 60, 1 / 60, 1 / 30)]
+    steps = [step_of(length_s) for length_s in (1 / 60, 1 / 60, 1 / 30)]
     assert lengths_of(steps) == {"1/60": 0.5, "1/30": 0.5}
     assert spread_of([]) == {} and spread_of(range(101)) == dict(median=50.0, p95=95.0, max=100.0)
 

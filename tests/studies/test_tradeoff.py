@@ -101,10 +101,11 @@ def test_a_rehearsals_expected_error_is_of_its_current_iterations():
     scene = scene_of(load_scene(EMBEDDED), setup)
     passes = {name: getattr(setup, name) for name in ("substeps", "iterations", "relaxation_factor")}
     measured = {point.setup: point.error_mean_mm for point in load_points()}
-    rehearsal = SimpleNamespace(scene=scene, settings=SimpleNamespace(**passes))
+    organ = SimpleNamespace(settings=SimpleNamespace(**passes))
+    rehearsal = SimpleNamespace(case=SimpleNamespace(scene=scene), organ=organ)
     assert numerical_error_of(rehearsal) == measured[setup]
     for changed in (dict(substeps=40), dict(iterations=900), dict(relaxation_factor=9.0)):
-        rehearsal.settings = SimpleNamespace(**(passes | changed))
+        organ.settings = SimpleNamespace(**(passes | changed))
         assert numerical_error_of(rehearsal) is None
 
 

@@ -14,12 +14,12 @@ from rehearsal.asked_files import AskedFiles, check_anatomy
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.tumour_measurements import Measurement
 from rehearsal.measurements.uncertainty_bands import UncertaintyBands, UncertaintyError, read_bands
-from rehearsal.rehearsal import Rehearsal
 from rehearsal.worker_processes import Workers
 from scenes.anatomy import LoadedAnatomy
 from scenes.mechanical_tissues import mechanical_properties
 from scenes.scene import Attachment, Scene, with_options
 from sim.fields import array_of
+from studies.harness import rehearsal_of
 from studies.uncertainty import uncertainty_command
 from studies.uncertainty.press_outcomes import QUANTITIES, PressProblem, press_outcome
 from studies.uncertainty.sensitivity import POSITION, bands_of, count_of, indices_of, samples_of
@@ -75,8 +75,8 @@ def test_what_is_declared_or_has_a_surface_is_varied_over_the_tables_range():
 
 def test_values_reach_the_solver(device, problem):
     at_once = problem.scene.press.model_copy(update=dict(warm_up_steps=0))
-    rehearsal = Rehearsal(problem.scene.model_copy(update=dict(press=at_once)), problem.anatomy)
-    model = rehearsal.model
+    rehearsal = rehearsal_of(problem.scene.model_copy(update=dict(press=at_once)), problem.anatomy)
+    model = rehearsal.organ.model
     tether, weight = array_of(model.tether), array_of(model.capsule.weight)
     values = {
         "kidney modulus": 7.0,
@@ -91,7 +91,7 @@ def test_values_reach_the_solver(device, problem):
     assert array_of(model.capsule.weight) == pytest.approx(2 * weight) and array_of(
         model.tether
     ) == pytest.approx(2 * tether)
-    assert rehearsal.contacts.coefficient == pytest.approx(0.2)
+    assert rehearsal.organ.contacts.coefficient == pytest.approx(0.2)
 
 
 @pytest.mark.usefixtures("nothing_built")
@@ -228,9 +228,10 @@ def test_a_band_is_around_the_value_and_grows_with_the_depth():
 
 
 def test_the_panel_shows_the_band_beside_the_measurement(device):
-    rehearsal = Rehearsal(with_options(briefly(0), {"tissue.cell_mm": 4.0}), small_anatomy())
-    rehearsal.pose = rehearsal.pose_at_depth(2.0)
-    measurements = LiveMeasurements(rehearsal, bands=bands())
+    rehearsal = rehearsal_of(with_options(briefly(0), {"tissue.cell_mm": 4.0}), small_anatomy())
+    rehearsal.organ.pose = rehearsal.pose_at_depth(2.0)
+    rehearsal.show()
+    measurements = LiveMeasurements(rehearsal.anatomy, rehearsal.manipulator, bands=bands())
     measurements.latest = Measurement(1.0, 20.0, force_n=0.5)
     found = measurements.findings()
     # Nothing pulls: a force below zero is none.
