@@ -6,7 +6,7 @@ from render.viewer import Controls, Geometry, Settings, View
 
 
 class NullViewer:
-    """What a ``WindowLoop`` asks of a window. It runs until a control quits; ``script`` gives the controls, frame by frame."""
+    """What a ``WindowLoop`` asks of a window; ``script`` has controls frame by frame, until one quits."""
 
     def __init__(self, settings: Settings | None = None, script=(), size: tuple[int, int] = (1280, 720)):
         self.settings = settings or Settings()

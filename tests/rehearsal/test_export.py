@@ -1,4 +1,4 @@
-"""What leaves for other programs: surfaces and volumes read back by others' readers, in the patient's coordinates."""
+"""What leaves for other programs: surfaces and volumes, in the patient's coordinates, by others' readers."""
 
 import io
 from contextlib import redirect_stderr

@@ -19,7 +19,7 @@ from ultrasound.sweep_file import write_sweep
 
 
 def placed(x: float, y: float = 0.0, tilt_deg: float = 0.0) -> np.ndarray:
-    """A probe 20 mm over the middle of the ball, looking down, beside it by so much: in PLUS's axes, in the patient."""
+    """A probe 20 mm over the ball's middle and beside it, looking down: in PLUS's axes, in the patient."""
     pose = np.eye(4)
     pose[:3, :3] = rotation_about([1, 0, 0], tilt_deg - 90.0)
     pose[:3, 3] = ORIGIN + [x, y, 20.0]
