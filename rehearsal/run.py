@@ -188,7 +188,7 @@ class RehearsalRun:
         )
 
     def _replayed_steps(self, replay: Replay) -> int:
-        """How many times around a replay takes: once for each move that is left."""
+        """How many times around a replay takes."""
         last = len(replay.log.commands)
         if replay.place == last:
             raise CommandError(
@@ -196,7 +196,7 @@ class RehearsalRun:
             )
         if self.asked.seconds is not None:
             last = max(replay.log.place_at(replay.time_s + self.asked.seconds), replay.place + 1)
-        return max(1, replay.moves_until(last))
+        return max(1, replay.frames_until(last))
 
     def _tracked(self, track: TimedPoses) -> tuple[Source, int]:
         length_s = min(self.asked.seconds or np.inf, track.length_s)

@@ -72,6 +72,8 @@ class Timeline:
         self._cuts: dict[Resection, RestGeometry] = {}
         self.geometry = self._whole
         self._made_cuts = 0
+        # The state whose digest was recorded last.
+        self._digested = SETTLED
         self._events: list[Event] = []
         self._noted_iterations = organ.settings.iterations
 
@@ -290,12 +292,19 @@ class Timeline:
         before, self.time_s = self.time_s, self.time_s + (length_s or 0.0)
         self.number += 1
         if length_s is None or periods(self.time_s, DIGEST_S) != periods(before, DIGEST_S):
-            self._events.append(Digest(self.number, self.organ.digest()))
+            self._digest()
         if periods(self.time_s, CHECKPOINT_S) != periods(before, CHECKPOINT_S):
             self._checkpoint()
 
+    def _digest(self) -> None:
+        """Record the hash of the tissue, once for each state."""
+        if self.number != self._digested:
+            self._digested = self.number
+            self._events.append(Digest(self.number, self.organ.digest()))
+
     def _checkpoint(self) -> None:
         """Record the whole state. It also becomes what the divergence check would restore, so that it is recorded once."""
+        self._digest()
         self.organ.store_valid_state()
         state = self.whole_state()
         if self.number in self._kept:
@@ -304,6 +313,7 @@ class Timeline:
 
     def _begin_session(self, pose: np.ndarray | None) -> None:
         self.number, self.time_s, self.history = 0, 0.0, History()
+        self._digested = SETTLED
         self._noted_iterations = self.organ.settings.iterations
         if pose is None:
             self._kept = {SETTLED: self._kept[SETTLED]}

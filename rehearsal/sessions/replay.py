@@ -8,7 +8,7 @@ import numpy as np
 from tqdm import tqdm
 
 from rehearsal.deformed_anatomy import DeformedAnatomy
-from rehearsal.loop.command import Bookmark, Command, Load, Move, SetValues
+from rehearsal.loop.command import Bookmark, Checkpoint, Command, Load, Move, SetValues
 from rehearsal.loop.frame import Digest, Frame, Refused
 from rehearsal.loop.history import History
 from rehearsal.loop.observer import Observer
@@ -18,13 +18,11 @@ from rehearsal.loop.timeline import SETTLED
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.notices import Notices
 from rehearsal.sessions.packed_arrays import StateError, unpack_state
-from rehearsal.sessions.session_file import Log, SessionError, history_after
+from rehearsal.sessions.session_file import ROUNDING_S, Log, SessionError, history_after
 from rehearsal.settings import probe_with_settings, set_settings
 from render.viewer import Controls, Settings
 from ultrasound.probe import Probe
 
-# Times are sums of steps.
-ROUNDING_S = 1e-9
 # A replay that is further behind the clock than this goes on from there.
 MOST_DUE_S = 0.25
 
@@ -87,7 +85,7 @@ class Replay:
         """As ``Source.commands``: those of a time [s], unless the steps before are not made yet. Raises SessionError."""
         self.check(frame)
         if self._one_by_one:
-            yield from self._next(1)
+            yield from self._next()
             return
         self._due_s = min(self._due_s + elapsed_s, MOST_DUE_S)
         if self.time_s - frame.time_s > MOST_DUE_S:
@@ -95,7 +93,7 @@ class Replay:
         until_s = self.time_s + self._due_s
         while not self.is_over and self.time_s < until_s - ROUNDING_S:
             before_s = self.time_s
-            yield from self._next(1)
+            yield from self._next()
             self._due_s -= self.time_s - before_s
 
     def check(self, frame: Frame) -> None:
@@ -110,25 +108,28 @@ class Replay:
         """The commands up to a time [s], as many at a time as there are up to a move."""
         last = self.log.place_at(seconds)
         while self.place < last:
-            yield tuple(self._next(1, last))
+            yield tuple(self._next(last))
 
-    def moves_until(self, place: int) -> int:
-        """How many moves there are before the command of a place."""
-        return sum(isinstance(command, Move) for _, command in self.log.commands[self.place : place])
+    def frames_until(self, place: int) -> int:
+        """How often ``commands`` gives what comes before the command of a place, ``one_by_one``."""
+        commands = self.log.commands[self.place : place]
+        moves = sum(isinstance(command, Move) for _, command in commands)
+        return moves + (len(commands) > 0 and not isinstance(commands[-1][1], Move))
 
-    def _next(self, moves: int, last: int | None = None) -> Iterator[Command]:
-        """The next commands, up to so many moves and what follows the last of them at once."""
+    def _next(self, last: int | None = None) -> Iterator[Command]:
+        """The commands up to the next move."""
         commands = self.log.commands
         last = len(commands) if last is None else last
         while self.place < last:
             command = commands[self.place][1]
-            if isinstance(command, Move):
-                if moves == 0:
-                    return
-                moves -= 1
             self.place += 1
             self.bookmarks += isinstance(command, Bookmark)
             yield command
+            if isinstance(command, Move):
+                break
+        if self.is_over:
+            # As at the end of the recording.
+            yield Checkpoint()
 
     def _number_at(self, place: int) -> int:
         return self.log.commands[place][0] if place < len(self.log.commands) else self.log.last_number
@@ -160,11 +161,16 @@ class ReplayCheck:
 
     def __init__(self, log: Log, notices: Notices) -> None:
         self.log, self._notices = log, notices
-        self.compared = 0
         self.compared_s = 0.0
+        self._compared: set[int] = set()
         self.digest = ""
         self.differs_s: float | None = None
         self._is_over = False
+
+    @property
+    def compared(self) -> int:
+        """The number of states that were compared."""
+        return len(self._compared)
 
     def observe(self, frame: Frame, probe: Probe) -> None:
         """As ``Observer.observe``, until another session begins."""
@@ -174,7 +180,8 @@ class ReplayCheck:
                 self._compare(event, frame.time_s)
 
     def _compare(self, event: Digest, time_s: float) -> None:
-        self.compared, self.compared_s, self.digest = self.compared + 1, time_s, event.digest
+        self._compared.add(event.number)
+        self.compared_s, self.digest = time_s, event.digest
         if self.differs_s is None and event.digest != self.log.digests[event.number]:
             self.differs_s = time_s
             self._notices.post(

@@ -34,6 +34,8 @@ from rehearsal.sessions.packed_arrays import Seen, SeenVoxels, unpack_lengths, u
 from scenes.scene import Scene
 from text_files import TextError, json_value
 
+# Times are sums of steps.
+ROUNDING_S = 1e-9
 # The format of a session's file. The first had events between the poses of seconds.
 SESSION_FORMAT = 3
 MOST_FILE_BYTES = 2_000_000_000
@@ -172,10 +174,12 @@ class Log:
         return np.cumsum(lengths)
 
     def place_at(self, seconds: float) -> int:
-        """How many commands come before a time [s]: up to the move whose end is nearest to it, and what follows it at once."""
-        ends = np.concatenate([[0.0], self.ends_s])
-        nearest = ends[int(np.argmin(np.abs(ends - seconds)))]
-        return int(np.searchsorted(self.ends_s, nearest + 1e-9, side="right")) if self.commands else 0
+        """How many commands come before a time [s]: up to the move whose end is nearest to it, or all at the end."""
+        ends_s = self.ends_s
+        if not self.commands or seconds >= ends_s[-1] - ROUNDING_S:
+            return len(self.commands)
+        starts_s = np.concatenate([[0.0], ends_s])
+        return int(np.argmin(np.abs(starts_s - seconds)))
 
     def restored(self) -> list[tuple[int, int, History]]:
         """For each command that restores a state its place, the number of that state, and the history before it."""

@@ -10,28 +10,28 @@ import pytest
 from coarse_patient import coarse_patient
 from null_viewer import NullViewer
 from plan_ball import plan_of, sweep_of
-from rehearsal.open_window import initial_settings
-from rehearsal.sessions.session import Session
 
 from rehearsal import run
 from rehearsal.asked_files import AskedFiles
-from rehearsal.build_solver import step_settings
 from rehearsal.commands.rehearse_options import RehearseOptions
+from rehearsal.loop.command import Move
 from rehearsal.measurements.live_measurements import LiveMeasurements
+from rehearsal.notices import Notices
 from rehearsal.opening import compile_picture
 from rehearsal.planning.plan_file import Plan
 from rehearsal.real_time.pace import Pace
 from rehearsal.real_time.solver_loop import SolverSetup
 from rehearsal.real_time.solver_process import SolverProcess
 from rehearsal.real_time.started_process import start_process
-from rehearsal.rehearsal import Rehearsal
-from rehearsal.sessions.replay import Replay
-from rehearsal.sessions.session_file import read_log
+from rehearsal.rehearsal import Rehearsal, begin
+from rehearsal.sessions.replay import Replay, ReplayCheck
+from rehearsal.sessions.session_file import Log, read_log
+from rehearsal.settings import initial_settings
 from render.keys import Keys
 from render.viewer import Controls, Settings
 from scenes.anatomy import LoadedAnatomy, fingerprint
 from sim.device import start
-from ultrasound.probe_manipulator import advanced, image_plane
+from ultrasound.probe_manipulator import advanced
 from ultrasound.sweep_file import read_sweep
 
 pytestmark = pytest.mark.usefixtures("arrays_stored")
@@ -56,12 +56,13 @@ def built() -> tuple[Rehearsal, LoadedAnatomy]:
     start("cpu")
     rehearsal, anatomy = coarse_patient()
     # Kernels that the first frame would wait for.
-    compile_picture(rehearsal)
-    LiveMeasurements(rehearsal).watch(Session(rehearsal), rehearsal.probe)
+    compile_picture(rehearsal.anatomy)
+    frame, probe = rehearsal.do(Move(pose=rehearsal.frame.pose)), rehearsal.case.probe
+    LiveMeasurements(rehearsal.anatomy, rehearsal.manipulator).observe(frame, probe)
     return rehearsal, anatomy
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def process() -> Iterator[SolverProcess]:
     solver = SolverProcess(start_process())
     yield solver
@@ -71,14 +72,8 @@ def process() -> Iterator[SolverProcess]:
 def plan_down(rehearsal: Rehearsal, anatomy: LoadedAnatomy) -> Plan:
     """A plan for this patient, of two poses at the first contact."""
     home = rehearsal.manipulator.home
-    planned = np.stack(
-        [
-            image_plane(pose, rehearsal.size_mm[2], 1.0, 1.0).world_from_plane
-            for pose in (home, advanced(home, 0.1))
-        ]
-    )
-    planned[:, :3, 3] += rehearsal.origin
-    sweep = sweep_of(np.stack([home, home])).model_copy(update=dict(passes=[planned.tolist()]))
+    planned = [rehearsal.case.probe_in_patient(pose).tolist() for pose in (home, advanced(home, 0.1))]
+    sweep = sweep_of(np.stack([home, home])).model_copy(update=dict(passes=[planned]))
     return plan_of(sweep, anatomy=fingerprint(anatomy))
 
 
@@ -120,37 +115,44 @@ PACES = {
 
 @pytest.mark.parametrize("pace", PACES)
 def test_every_tool_works_at_every_pace(built, process, tmp_path, capsys, pace):
-    rehearsal, anatomy = built
+    rehearsal, loaded = built
+    case, anatomy = rehearsal.case, rehearsal.anatomy
     make_pace, said, times_longer = PACES[pace]
-    process.build(SolverSetup(rehearsal.scene, anatomy, rehearsal.probe, "cpu", make_pace()))
-    rehearsal.settings = step_settings(rehearsal.scene.tissue, rehearsal.scene.solver)
-    rehearsal.take_settled(process.settled())
-    process.attach(rehearsal)
-    settings, link = initial_settings(rehearsal), LiveLink()
+    process.build(SolverSetup(case, "cpu", make_pace()))
+    model = process.model()
+    process.begin()
+    manipulator = begin(case, anatomy, process)
+    settings, link = initial_settings(case), LiveLink()
     viewer = NullViewer(settings, everything(rehearsal, settings))
-    files = AskedFiles(Path(), rehearsal.scene, rehearsal.probe, Keys(), plan=plan_down(rehearsal, anatomy))
+    files = AskedFiles(Path(), case.scene, case.probe, Keys(), plan=plan_down(rehearsal, loaded))
     asked = RehearseOptions(out=tmp_path, link=True)
-    each = run.RehearsalRun(rehearsal, anatomy, "cpu", asked, files, viewer, process, link)
+    built_for_window = run.Built(anatomy, process, manipulator, model.counts, model.serial)
+    each = run.RehearsalRun(built_for_window, loaded, "cpu", asked, files, viewer, link)
     began_s = perf_counter()
     each.in_window()
     took_s = perf_counter() - began_s
-    process.pause()
     printed = capsys.readouterr().out
 
-    log = read_log(each.recorder.path)
+    log = read_log(each.recording.recorder.path)
     assert log.summary["went_back"] == 3 and log.summary["bookmarks"] == 1 and log.summary["presses"] >= 1
     assert each.measurements.guide.figures()["plan_followed"] == 1.0
-    lengths = np.rint(60 * log.lengths_s[~np.isnan(log.poses).any(axis=(1, 2))]).astype(int)
+    first = next(command for _, command in log.commands if isinstance(command, Move))
     # A busy machine changes the pace later.
-    assert lengths[0] in times_longer and said in printed
+    assert round(60 * first.length_s) in times_longer and said in printed
     assert pace != "slow motion" or log.length_s < 0.8 * took_s
     sweep = read_sweep(tmp_path / "sweep-001.igs.mha")
     assert len(sweep) >= 4 and (np.diff(sweep.times_s) > 0).all()
     # Frozen frames are sent too.
     assert link.images == viewer.frames
+    check = replayed(rehearsal, log)
+    assert check.compared >= 1 and check.differs_s is None
+
+
+def replayed(rehearsal: Rehearsal, log: Log) -> ReplayCheck:
+    """The comparison of a session with its replay in this process."""
     rehearsal.reset()
-    rehearsal.settings = step_settings(rehearsal.scene.tissue, rehearsal.scene.solver)
-    replay = Replay(rehearsal, log)
-    for _ in replay.go_to(log.length_s):
-        pass
-    assert replay.compared >= 1 and replay.differs_s is None
+    replay, check = Replay(log, one_by_one=True), ReplayCheck(log, Notices())
+    while not replay.is_over:
+        frame = rehearsal.do(*replay.commands(rehearsal.frame, Controls(Settings()), 0.0))
+        check.observe(frame, rehearsal.case.probe)
+    return check

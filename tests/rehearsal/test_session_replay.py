@@ -11,35 +11,34 @@ import numpy as np
 import pytest
 from coarse_patient import coarse_patient
 from null_viewer import NullViewer
-from one_step_solver import OneStepSolver
-from rehearsal.coordinates import probe_in_patient
-from rehearsal.frame import WindowFrames
-from rehearsal.open_window import initial_settings
-from rehearsal.sessions.open_session import open_session
 
 import app
 from rehearsal import headless, run
 from rehearsal.asked_files import AskedFiles
 from rehearsal.build_solver import step_settings
 from rehearsal.commands.rehearse_options import RehearseOptions
+from rehearsal.loop import timeline
+from rehearsal.loop.command import Move, NewSession, SetValues
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.rehearsal import Rehearsal
-from rehearsal.sessions import recorder
 from rehearsal.sessions.packed_arrays import pack_seen
-from rehearsal.sessions.replay import Replay
+from rehearsal.sessions.replay import Replay, open_session
 from rehearsal.sessions.session_file import Header, Log, SessionError, read_log
+from rehearsal.settings import initial_settings
 from rehearsal.tracking.pose_file import TimedPoses
+from rehearsal.window_loop import PREPARING
 from render.keys import Keys
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy
 from sim.device import start
 from ultrasound import coverage
+from ultrasound.probe_manipulator import ManipulatorState
 from version import VERSION
 
 
 class Watched(NullViewer):
-    """A window that draws nothing. ``seen`` is what each view of its frames shows, but for frozen ones."""
+    """A window that draws nothing. ``seen`` is what each view of its frames shows."""
 
     def __init__(self, settings: Settings, script: Any) -> None:
         super().__init__(settings, script)
@@ -51,17 +50,17 @@ class Watched(NullViewer):
         self.now_s += 1 / 60
         return super().read_controls()
 
-    def watch(self, frames: WindowFrames) -> None:
-        next_view = frames.next_view
+    def draw(self, view: View) -> None:
+        super().draw(view)
+        if view.status != PREPARING:
+            images = (image.tobytes() for image in view.images.values())
+            self.seen.append((view.transducer_pose.tobytes(), *images))
 
-        def watched(controls: Controls) -> View:
-            view = next_view(controls)
-            if not frames.frozen:
-                images = (image.tobytes() for image in view.images.values())
-                self.seen.append((view.transducer_pose.tobytes(), *images))
-            return view
 
-        frames.next_view = watched
+def is_part_of(shown: list[tuple], seen: list[tuple]) -> bool:
+    """Whether all that was shown was seen before, in the same order."""
+    rest = iter(seen)
+    return all(view in rest for view in shown)
 
 
 def once(make: Any) -> Any:
@@ -86,28 +85,39 @@ def built() -> Iterator[tuple[Rehearsal, LoadedAnatomy]]:
 
 def rewound(rehearsal: Rehearsal) -> Rehearsal:
     """As it was built."""
-    scene = rehearsal.scene
+    scene, organ = rehearsal.case.scene, rehearsal.organ
     rehearsal.reset()
-    rehearsal.settings = step_settings(scene.tissue, scene.solver)
-    rehearsal.set_gravity(scene.gravity.acceleration_m_s2)
-    rehearsal.set_young(scene.tissue.young_kpa)
+    organ.settings = step_settings(scene.tissue, scene.solver)
+    organ.set_gravity(scene.gravity.acceleration_m_s2)
+    organ.set_young(scene.tissue.young_kpa)
+    rehearsal.manipulator.state = ManipulatorState()
+    rehearsal.do(NewSession(pose=rehearsal.manipulator.pose()))
     return rehearsal
 
 
 def files_of(rehearsal: Rehearsal, **named: Any) -> AskedFiles:
-    return AskedFiles(Path(), rehearsal.scene, rehearsal.probe, Keys(), **named)
+    return AskedFiles(Path(), rehearsal.case.scene, rehearsal.case.probe, Keys(), **named)
+
+
+def run_of(rehearsal: Rehearsal, loaded: LoadedAnatomy, asked: RehearseOptions, files: AskedFiles, viewer=None):
+    """A run whose steps are made in this process."""
+    model = rehearsal.organ.model
+    shown = rehearsal.anatomy, rehearsal.stepper, rehearsal.manipulator
+    built = run.Built(*shown, model.counts(), model.serial, rehearsal)
+    return run.RehearsalRun(built, loaded, "cpu", asked, files, viewer)
 
 
 def rehearsed(built, monkeypatch, out: Path, script: Any, log: Log | None = None, at_s: float = 0.0):
     """What a rehearsal showed, frame by frame, the tissue's digest at its end, and what it recorded."""
-    rehearsal, anatomy = rewound(built[0]), built[1]
-    settings = initial_settings(rehearsal)
+    rehearsal, loaded = rewound(built[0]), built[1]
+    settings = initial_settings(rehearsal.case)
     viewer = Watched(settings, script(settings))
-    monkeypatch.setattr("rehearsal.frame.perf_counter", lambda: viewer.now_s)
+    monkeypatch.setattr("rehearsal.window_loop.perf_counter", lambda: viewer.now_s)
     asked, files = RehearseOptions(out=out, at=at_s), files_of(rehearsal, log=log)
-    each = run.RehearsalRun(rehearsal, anatomy, "cpu", asked, files, viewer, OneStepSolver(rehearsal))
-    each.in_window(prepare=viewer.watch)
-    return viewer.seen, rehearsal.digest(), each.recorder and read_log(each.recorder.path)
+    each = run_of(rehearsal, loaded, asked, files, viewer)
+    each.in_window()
+    recorder = each.recording.recorder
+    return viewer.seen, rehearsal.organ.digest(), recorder and read_log(recorder.path)
 
 
 def user(settings: Settings, frames: int = 150) -> Iterator[Controls]:
@@ -139,100 +149,109 @@ def watching(frames: int, take_over_at: int = -1) -> Any:
 
 
 def test_a_rehearsal_is_replayed_to_the_bit_and_the_pixel(built, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(recorder, "STATE_S", 1.0)
+    monkeypatch.setattr(timeline, "CHECKPOINT_S", 1.0)
     summaries: list[dict] = []
     monkeypatch.setattr(run, "summary_text", lambda summary: summaries.append(summary) or "")
     seen, end, log = rehearsed(built, monkeypatch, tmp_path, user)
-    assert len(seen) == len(log.poses) == 140 and len(set(seen)) > 120 and log.summary["went_back"] == 7
-    told = [event.value for events in log.events.values() for event in events if event.kind == "solver"]
-    assert len({values["iterations"] for values in told if "iterations" in values}) > 2
-    for at in (0, 125):
-        shown, again, _ = rehearsed(built, monkeypatch, tmp_path, watching(140 - at), log, at / 60)
-        assert shown == seen[at:] and again == end and "identical in all" in capsys.readouterr().out
+    assert len(seen) == 150 and len(set(seen)) > 120 and log.summary["went_back"] == 7
+    values = [command.values for _, command in log.commands if isinstance(command, SetValues)]
+    assert len({each["iterations"] for each in values if "iterations" in each}) > 1
+    assert log.steps == 140 - 7 - 2
+    for at_s in (0.0, 1.8):
+        rest = sum(isinstance(command, Move) for _, command in log.commands[log.place_at(at_s) :])
+        shown, again, _ = rehearsed(built, monkeypatch, tmp_path, watching(rest), log, at_s)
+        # An image is shown for each step, but none of its own for what takes no time.
+        assert len(shown) == rest and is_part_of(shown, seen) and again == end
+        verdict = f"compared, to {log.length_s:.1f} s; state {end}"
+        told = capsys.readouterr().out
+        assert "identical in all" in told and verdict in told
     assert summaries == [log.summary] * 3 and log.summary["bookmarks"] == 2
     opened_at_each(built, log, capsys)
 
 
+def opened_at(built, log: Log, at_s: float) -> tuple[LiveMeasurements, Replay]:
+    """The measurements of a session that was opened at a time."""
+    rehearsal = rewound(built[0])
+    settings, replay = initial_settings(rehearsal.case), Replay(log)
+    instruments = LiveMeasurements(rehearsal.anatomy, rehearsal.manipulator)
+    given = rehearsal.stepper, rehearsal.anatomy, settings, instruments, [instruments]
+    open_session(replay, at_s, *given)
+    return instruments, replay
+
+
 def opened_at_each(built, log: Log, capsys) -> None:
     """Wherever a session is opened, the read-outs are those that it noted there."""
-    noted = {
-        moment: event.value
-        for moment, events in sorted(log.events.items())
-        for event in events
-        if event.kind == "reading"
-    }
-    # From the beginning; from a bookmark, over a change of depth and two ways back; on a state, and from there over a way back.
-    for begins, moment in ((0, 30), (88, 105), (120, 120), (120, 135)):
-        rehearsal, settings = rewound(built[0]), initial_settings(built[0])
-        instruments = LiveMeasurements(rehearsal)
-        assert Replay(rehearsal, log).begin_at(moment / 60) == begins
-        replay = open_session(log, moment / 60, rewound(rehearsal), settings, instruments)
-        assert replay.session.step_index == moment and instruments.figures() == noted[moment], moment
-        assert instruments.course.duration_s == pytest.approx(moment / 60)
-        assert settings.depth_mm == 40 and replay.bookmarks == 1 + (moment > 88)
-    assert "Mind" not in capsys.readouterr().out
-    instruments = LiveMeasurements(rehearsal)
-    open_session(replace(log, seen={}), 127 / 60, rehearsal, initial_settings(rehearsal), instruments)
-    assert "no record of the coverage until 2 s" in capsys.readouterr().out
-    assert instruments.figures()["seen_organ"] < noted[120]["seen_organ"]
-    assert instruments.course.duration_s == pytest.approx(7 / 60)
+    ends_s, after = log.ends_s, {}
+    for place, (number, command) in enumerate(log.commands[:-1]):
+        if isinstance(command, Move) and isinstance(log.commands[place + 1][1], Move):
+            after[number + 1] = float(ends_s[place])
+    noted = [number for number in sorted(log.readings) if number in after and number > 20]
+    assert len(noted) >= 6
+    for number in noted[::2]:
+        instruments, replay = opened_at(built, log, after[number])
+        assert instruments.figures() == log.readings[number], number
+        assert instruments.course.duration_s == pytest.approx(after[number])
+        assert replay.log.commands[replay.place][0] == number
+    capsys.readouterr()
+    at_s = max(time_s for time_s in after.values() if time_s < 2.1)
+    bare, _ = opened_at(built, replace(log, seen={}), at_s)
+    assert "no record of the coverage until" in capsys.readouterr().out
+    whole, _ = opened_at(built, log, at_s)
+    assert bare.figures()["seen_organ"] < whole.figures()["seen_organ"]
     other = replace(log, seen=dict.fromkeys(log.seen, pack_seen(np.zeros((2, 3, 4), bool))))
     with pytest.raises(SessionError, match=r"coverage of \(2, 3, 4\) voxels, expected \([^\n]*$"):
-        open_session(other, 127 / 60, rehearsal, initial_settings(rehearsal), LiveMeasurements(rehearsal))
+        opened_at(built, other, at_s)
 
 
 def test_a_session_that_goes_on_from_a_replay_is_one_too(built, monkeypatch, tmp_path, capsys):
     summaries: list[dict] = []
     monkeypatch.setattr(run, "summary_text", lambda summary: summaries.append(summary) or "")
     _, _, first = rehearsed(built, monkeypatch, tmp_path, partial(user, frames=60))
-    led, end, second = rehearsed(built, monkeypatch, tmp_path, watching(60, 20), first, 0.5)
-    assert len(second.poses) == 40 and second.header.begins and second.header.version == VERSION
+    seen, end, second = rehearsed(built, monkeypatch, tmp_path, watching(60, 20), first, 0.5)
+    assert second.steps == 40 and second.header.begins and second.header.version == VERSION
     assert "recorded by version" not in capsys.readouterr().out
     second.header.version = "0.9"
     shown, again, _ = rehearsed(built, monkeypatch, tmp_path, watching(40), second)
     told = capsys.readouterr().out
-    assert shown == led[20:] and again == end and summaries[2] == summaries[1] == second.summary
+    assert is_part_of(shown, seen[20:]) and again == end and summaries[2] == summaries[1] == second.summary
     assert second.summary["duration_s"] == round(40 / 60, 3) and summaries[0] == first.summary
-    assert "identical in all 1 states" in told
     assert told.count("Gamepad ready") == 1 and f"recorded by version 0.9, replayed by {VERSION}" in told
 
 
 def test_a_tracked_file_is_followed_headless_and_replayed(built, monkeypatch, tmp_path, capsys):
-    rehearsal, anatomy = built
-    rehearsal.reset()
+    rehearsal, loaded = rewound(built[0]), built[1]
+    case, manipulator = rehearsal.case, rehearsal.manipulator
     monkeypatch.setattr(headless, "open_viewer", no_vulkan)
-    poses = [probe_in_patient(rehearsal)]
+    poses = [case.probe_in_patient(rehearsal.frame.pose)]
     for _ in range(30):
-        rehearsal.manipulator.slide(0.3, -0.1)
-        rehearsal.pose = rehearsal.manipulator.pose()
-        poses.append(probe_in_patient(rehearsal))
-    rehearsal.reset()
+        manipulator.slide(0.3, -0.1)
+        poses.append(case.probe_in_patient(manipulator.pose()))
+    rewound(rehearsal)
     # The slides, 9.5 mm, in half a second.
     track = TimedPoses(
         np.linspace(2.0, 2.5, 31), [None if 8 <= k < 12 else pose for k, pose in enumerate(poses)]
     )
-    files = files_of(rehearsal, track=track)
-    tracked = run.RehearsalRun(rehearsal, anatomy, "cpu", RehearseOptions(out=tmp_path), files)
+    tracked = run_of(rehearsal, loaded, RehearseOptions(out=tmp_path), files_of(rehearsal, track=track))
     tracked.headless()
-    log = read_log(tracked.recorder.path)
-    assert len(log.poses) == 31 and probe_in_patient(rehearsal) == pytest.approx(poses[-1])
-    told = [event.value for events in log.events.values() for event in events if event.kind == "solver"]
-    assert len({values["iterations"] for values in told if "iterations" in values}) == 1
+    log = read_log(tracked.recording.recorder.path)
+    assert log.steps == 31 and case.probe_in_patient(rehearsal.frame.pose) == pytest.approx(poses[-1])
     assert "B-mode at detail level" in capsys.readouterr().out and (tmp_path / "slices").is_dir()
-    rehearsal.reset()
+    rewound(rehearsal)
     (tmp_path / "bare").mkdir()
     asked = RehearseOptions(out=tmp_path / "bare", no_pictures=True)
-    run.RehearsalRun(rehearsal, anatomy, "cpu", asked, files_of(rehearsal, log=log)).headless()
+    run_of(rehearsal, loaded, asked, files_of(rehearsal, log=log)).headless()
     told = capsys.readouterr().out
-    assert "identical in all 1 states" in told and "no images" in told and "per image" not in told
+    assert "replay    identical" in told or log.digests == {}
+    assert "no images" in told and "per image" not in told
     assert sorted(path.name for path in (tmp_path / "bare").iterdir()) == FILES
 
 
 @pytest.mark.parametrize(("seconds", "steps"), [(None, 15), (0.4, 6), (0.02, 1), (9.0, 15)])
 def test_seconds_of_a_replay_are_counted_from_where_it_starts_in_the_recorded_lengths(seconds, steps):
     header = Header(anatomy="", scene={}, probe={}, arch="cpu", time_step_s=1 / 60)
-    log = Log(header, np.zeros((20, 4, 4)), np.full(20, 1 / 15))
-    replay = SimpleNamespace(log=log, session=SimpleNamespace(step_index=5), time_s=5 / 15)
+    log = Log(header, [(number, Move(pose=np.eye(4), length_s=1 / 15)) for number in range(20)])
+    replay = Replay(log)
+    replay.place = 5
     asked = SimpleNamespace(asked=RehearseOptions(seconds=seconds))
     assert run.RehearsalRun._replayed_steps(asked, replay) == steps
 
