@@ -1,12 +1,12 @@
-"""A viewer that draws nothing."""
+"""A window that draws nothing."""
 
 import numpy as np
 
-from render.viewer import Controls, Settings, View
+from render.viewer import Controls, Geometry, Settings, View
 
 
 class NullViewer:
-    """Draws nothing: for tests. It runs until `close`; `script` gives the controls, frame by frame."""
+    """What a ``WindowLoop`` asks of a window; ``script`` has controls frame by frame, until one quits."""
 
     def __init__(self, settings: Settings | None = None, script=(), size: tuple[int, int] = (1280, 720)):
         self.settings = settings or Settings()
@@ -27,6 +27,8 @@ class NullViewer:
     def image_shape(self, count: int, width_mm: float, depth_mm: float) -> tuple[int, int]:
         return self._size
 
+    def change_geometry(self, geometry: Geometry) -> None: ...
+
     def draw_scene(self, view: View, may_wait: bool) -> None: ...
 
     def draw(self, view: View) -> None:
@@ -35,6 +37,3 @@ class NullViewer:
     def picture(self) -> np.ndarray:
         width, height = self._size
         return np.zeros((height, width, 3), dtype=np.uint8)
-
-    def close(self) -> None:
-        self._running = False

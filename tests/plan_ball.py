@@ -20,7 +20,7 @@ SIZE = np.array([16.0, 9.0, 20.0])
 ORIGIN = np.array([100.0, -200.0, 300.0])
 X, Y, Z = np.eye(3)
 PROBE = load_probe("linear").model_copy(update=dict(housing_mm=tuple(SIZE)))
-# The ball's facets lie up to 2.2^2 / (8 R) = 0.02 mm inside it, and its patches' normals half a degree beside its radii.
+# The ball's facets lie up to 2.2^2 / (8 R) = 0.02 mm inside it, their normals half a degree off its radii.
 FACET_MM, NORMAL_DEG = 0.03, 0.5
 GOOD = ScoreTerms(
     seen=0.9,

@@ -8,6 +8,7 @@ import shlex
 import tomllib
 from functools import cache
 from pathlib import Path
+from typing import get_args
 
 import click
 import pytest
@@ -15,8 +16,9 @@ import taichi as ti
 from conftest import ROOT
 
 import app
+from rehearsal.loop.command import Recorded
 from rehearsal.planning.plan_file import Plan, PlannedSweep
-from rehearsal.sessions.session_file import End, Event, Header, Second
+from rehearsal.sessions.session_file import LINES, Header
 from rehearsal.tracking.pose_file import load_poses, load_timed_poses
 from scenes.import_findings import GridFindings, ImportFindings, ImportWarning, SurfaceFindings
 from scenes.scene import Image, Scene, Trocar
@@ -290,13 +292,13 @@ def section(heading: str) -> set[str]:
     ("heading", "models"),
     [
         ("Scene", [NeoHookeanTissue, ShapeMatchingTissue, Trocar]),
-        ("Session", [Header, Event, Second, End]),
+        ("Session", [Header, *LINES.values(), *get_args(Recorded)]),
         ("Plan", [Plan, PlannedSweep]),
         ("Findings of an import", [ImportFindings, ImportWarning, GridFindings, SurfaceFindings]),
     ],
 )
 def test_data_formats_list_every_key(heading, models):
-    keys = {key for model in models for key in model.model_fields}
+    keys = {key for model in models for key, field in model.model_fields.items() if not field.exclude}
     if heading == "Scene":
         keys |= {"title"}
         for name, field in Scene.model_fields.items():

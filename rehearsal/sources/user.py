@@ -60,6 +60,8 @@ class UserSource:
     ) -> None:
         self.anatomy, self.notices, self.tracker = anatomy, notices, tracker
         self.hand = Hand(manipulator, waits)
+        if waits and tracker is not None:
+            tracker.wait()
         self._script, self._plan, self._is_seen = script, resection_plan, is_seen
         # The pose that the hand asked for last.
         self._goal = anatomy.pose

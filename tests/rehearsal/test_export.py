@@ -1,4 +1,4 @@
-"""What leaves for other programs: surfaces and volumes read back by others' readers, in the patient's coordinates."""
+"""What leaves for other programs: surfaces and volumes, in the patient's coordinates, by others' readers."""
 
 import io
 from contextlib import redirect_stderr
@@ -13,9 +13,9 @@ from conftest import rotation_about
 
 import app
 from rehearsal.image_and_surface_files import save_surfaces
+from rehearsal.resection.resection_state import NO_RESECTION
 from scenes.surfaces import FORMATS, save_surface
 from scenes.volumes.volume_files import save_image
-from sim.fields import field_of
 
 pytestmark = pytest.mark.usefixtures("one_device")
 
@@ -130,24 +130,23 @@ def test_a_surface_says_its_space_and_reads_back_to_float32(tmp_path, suffix):
 
 
 def lying(tumour: bool) -> SimpleNamespace:
-    """What a rehearsal has of its surfaces: at rest and as they lie, about an origin."""
-    rest = body()
-    moved = (rest.vertices - MIDDLE).astype(np.float32) + np.float32([0, 0, 2.5])
+    """What a file needs of an anatomy: surfaces at rest and as they lie, about an origin."""
+    rest, moved_tumour = body(), body(3.0, 0.2).vertices - MIDDLE + [1.0, 0, 0]
     return SimpleNamespace(
-        origin=MIDDLE,
+        case=SimpleNamespace(origin=MIDDLE),
         organ=rest,
-        cut=None,
-        score=None,
-        organ_skin=SimpleNamespace(vertices=field_of(moved, 1)),
+        vertices=rest.vertices - MIDDLE + [0, 0, 2.5],
         tumour=body(3.0, 0.2) if tumour else None,
-        tumour_vertices=lambda: body(3.0, 0.2).vertices - MIDDLE + [1.0, 0, 0],
+        tumour_vertices=moved_tumour,
+        cut=None,
+        frame=SimpleNamespace(resection=NO_RESECTION),
     )
 
 
 def test_organ_and_tumour_are_saved_as_they_lie_vertex_by_vertex(tmp_path, capsys):
     save_surfaces(lying(tumour=True), tmp_path, "004-")
     organ, tumour = vertices_of(tmp_path / "004-organ.ply"), vertices_of(tmp_path / "004-tumour.ply")
-    # A float32 of 1204 mm is good to 6e-5, twice.
+    # A float32 of 1204 mm is good to 6e-5.
     assert np.allclose(organ, body().vertices + [0, 0, 2.5], atol=2e-4)
     assert np.allclose(tumour, body(4.0, 0.2).vertices, atol=2e-4)
     assert capsys.readouterr().out.count("Saved ") == 2

@@ -1,4 +1,4 @@
-"""The scene that an import writes: with every combination of parts it loads and is pressed; the probe starts on the organ."""
+"""The scene that an import writes is pressed with any parts; the probe starts on the organ."""
 
 from dataclasses import replace
 from pathlib import Path

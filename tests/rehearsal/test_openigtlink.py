@@ -140,7 +140,8 @@ def test_a_client_gets_pictures_and_poses_at_thirty_a_second(server, client):
     feeder.join()
     for messages in got.values():
         numbers = [round(30 * message.timestamp) for message in messages]
-        # pyigtl's client keeps one message a device: where it is held up, a later one takes an earlier one's place.
+        # pyigtl's client keeps one message a device: where it is held up, a later one takes an earlier one's
+        # place.
         assert len(set(numbers) - {0}) >= 0.9 * fed and numbers == sorted(numbers) and numbers[-1] == fed
     for number, message in ((round(30 * each.timestamp), each) for each in got[IMAGE]):
         assert np.array_equal(message.image[0], live(number).grey)
@@ -152,7 +153,7 @@ def test_a_client_gets_pictures_and_poses_at_thirty_a_second(server, client):
 
 
 def test_the_corner_pixels_are_where_they_are_in_the_patient(server):
-    """The oracle: a curved array's picture of 40 rows and 24 columns laid out by hand, the message read by the protocol's text."""
+    """A curved array's picture of 40 rows and 24 columns laid out by hand, read by the protocol's text."""
     rows, columns = 40, 24
     probe = load_probe("curvilinear")
     width, depth, above = probe.extent_mm

@@ -56,8 +56,8 @@ STATE = state_of([-0.0, 1e-45, -2.5], [3.4e38, 1 / 3, -7])
 
 def test_a_state_as_text_keeps_every_bit():
     pairs = list(zip(arrays_of(STATE), arrays_of(unpack_state(pack_state(STATE), POSITIONS)), strict=True))
-    # Now and when last good: position, velocity and contacts; the check's four; pose, steps; marks, and of the cut its four settings, what
-    # was seen, and the nodes; no manipulator.
+    # Now and when last good: position, velocity and contacts; the check's four; pose, steps; marks, and of
+    # the cut its four settings, what was seen, and the nodes; no manipulator.
     assert len(pairs) == 2 * 3 + 4 + 2 + 1 + 4 + 2 + 1
     assert all(old.dtype == new.dtype and old.tobytes() == new.tobytes() for old, new in pairs)
 

@@ -121,8 +121,8 @@ def test_a_pass_along_its_layout_has_the_axes_of_that(manipulator):
     faces = faces_in(poses)
     assert faces[:, 1] == pytest.approx(3.0)
     assert faces[:, 0] == pytest.approx(-np.linspace(-15, 15, len(poses)))
-    # The highest place under the face is that of its footprint which is nearest to the ball's axis; where that is at an
-    # edge, the nearest sample lies up to 1.2 mm from it, on a slope of 0.4 at most.
+    # The highest place under the face is that of its footprint which is nearest to the ball's axis; where
+    # that is at an edge, the nearest sample lies up to 1.2 mm from it, on a slope of 0.4 at most.
     beside = np.maximum(np.abs(faces[:, 0]) - SIZE[1] / 2, 0)
     assert faces[:, 2] == pytest.approx(np.sqrt(R**2 - beside**2) - 1.0, abs=1.2 * 0.4)
     assert faces[beside == 0, 2] == pytest.approx(R - 1.0, abs=FACET_MM)
@@ -206,7 +206,7 @@ def test_incidence_is_the_mean_angle_to_the_surface(manipulator):
 
 
 def test_the_terms_of_a_path_are_those_of_its_poses(manipulator):
-    """Over its limit of 5 mm in two of five poses, and restored in one of these and another; one of three holds is not possible."""
+    """Over 5 mm in two of five poses, restored in one of these and another; one of three cannot be held."""
     case = case_of_ball(scene=Scene(anatomy={}, transducer=dict(compression_warning_mm=5.0)))
     held = np.array([True, False, True])
     trial = SimpleNamespace(case=case, manipulator=manipulator, held=lambda passes: held)
@@ -359,8 +359,10 @@ def test_from_one_pass_to_the_next_the_probe_moves_outside_the_organ(apart_deg, 
 
 def test_the_score_terms_are_a_sentence():
     assert in_words(ScoreTerms(0.94, 2.2, 3.4, 0.0, 0.97, 4.6, 211.0, 21.0, 1.0)) == (
-        "it covers 94 % of the target, compresses the tissue by 2.2 mm on average, by 3.4 mm at most, exceeds the compression limit at 0 % of its poses, "
-        "has contact on 97 % of the array, has a mean angle of incidence of 5 degrees, and has a path of 211 mm"
+        "it covers 94 % of the target, compresses the tissue by 2.2 mm on average, by 3.4 mm at most, "
+        "exceeds the compression limit at 0 % of its poses, "
+        "has contact on 97 % of the array, has a mean angle of incidence of 5 degrees, "
+        "and has a path of 211 mm"
     )
 
 

@@ -55,7 +55,8 @@ def test_a_plan_followed_exactly_is_completed_without_deviation():
     assert guide.figures() == pytest.approx(dict(plan_followed=1.0, plan_off_mm=0.0, plan_off_deg=0.0))
     assert guide.guidance().goal is None and guide.guidance().done.all()
     assert guide.in_words(0.5) == (
-        "plan      two passes: 100 % completed, mean deviation 0.0 mm and 0 degrees; coverage of margin 50 % (planned 75 %)"
+        "plan      two passes: 100 % completed, mean deviation 0.0 mm and 0 degrees; "
+        "coverage of margin 50 % (planned 75 %)"
     )
     guide.follow(SECOND[-1])
     assert guide.figures()["plan_followed"] == 1.0
@@ -75,8 +76,10 @@ def test_the_deviation_is_the_distance_of_the_face_and_the_angle():
 
 @pytest.mark.parametrize("offset", [0.0, 2.0])
 def test_each_pose_counts_at_its_least_distance_and_is_not_completed_before(offset):
-    """In tenths of a step, from above the first: one that is gone to exactly is behind from a millimetre before it on, any other
-    where the next is nearer, and the last where the one before it is not."""
+    """In tenths of a step, from above the first. One reached exactly is completed a millimetre before it.
+
+    Any other is completed where the next is nearer, the last where the one before it is not.
+    """
     guide = guide_of(sweep_of(straight_pass(11, step_mm=1.5)))
     (begin,) = straight_pass(1, offset)
     for height in np.arange(8.0, 1.0, -0.25):

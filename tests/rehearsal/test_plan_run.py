@@ -1,4 +1,4 @@
-"""A plan made by the command on a coarse ball, tried, and followed: reproducible, and consistent with the compression."""
+"""A plan made by the command on a coarse ball, tried, and followed: reproducible, and true to compression."""
 
 import io
 import re
@@ -42,7 +42,7 @@ class Here:
 
 @dataclass
 class Made:
-    """A patient's folder with ``plan.json`` in it, what the commands said that made and followed it, and a trial of its problem."""
+    """A patient's folder with ``plan.json``, what its commands said, and a trial of its problem."""
 
     folder: Path
     plan: Plan
@@ -201,8 +201,8 @@ def test_two_passes_cover_more_than_either_and_the_probe_is_lifted_between(trial
     monkeypatch.setattr(trial.rehearsal, "advance", noted)
     together = run(trial, both)
     assert max(one.seen, other.seen) < together.seen
-    # From above, along a pass, up, over, down, along the other: never deeper than the passes, and up in between.
-    # The first step ends 3 mm above.
+    # From above, along a pass, up, over, down, along the other: never deeper than the passes, and up in
+    # between. The first step ends 3 mm above.
     assert max(depths) < 2.0 + 0.5 and depths[0] == pytest.approx(-3.0, abs=1e-9)
     middle = depths[len(depths) // 3 : 2 * len(depths) // 3]
     assert min(middle) < -3.0
@@ -235,5 +235,6 @@ def test_a_plan_is_followed_exactly_without_a_window_and_says_so(made):
     begin = f"plan      {made.plan.sweeps[0].name}: 100 % completed, mean deviation "
     (line,) = [each for each in made.followed if each.startswith(begin)]
     mm, degrees = re.fullmatch(r"([0-9.]+) mm and ([0-9]+) degrees", line.removeprefix(begin)).groups()
-    # No pose is farther than half a step of the rehearsal from where the probe was: 1 mm or 1.5 degrees at this speed.
+    # No pose is farther than half a step of the rehearsal from where the probe was: 1 mm or 1.5 degrees at
+    # this speed.
     assert float(mm) <= 0.5 and float(degrees) <= 1

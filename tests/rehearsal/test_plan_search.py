@@ -1,4 +1,4 @@
-"""The search for a plan: variations, who has how many trials, and what a plan is made of; with processes that only count."""
+"""The search for a plan: variations, trials of each search, what a plan is made of; processes only count."""
 
 import re
 from collections.abc import Iterator
@@ -54,7 +54,7 @@ def trial_of(kind: PassKind, parameters: np.ndarray, handicap: float = 0.0) -> T
 
 
 class Counting:
-    """No processes: a pass is worth what its numbers say, and every task is written down. Sides have handicaps."""
+    """No processes: a pass is worth what its numbers say; tasks are written down. Sides have handicaps."""
 
     def __init__(self, handicaps: dict[str, float], reachable: bool = True) -> None:
         self.kinds = [kind(side) for side in handicaps]

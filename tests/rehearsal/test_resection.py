@@ -1,4 +1,4 @@
-"""A resection in a rehearsal: marks from the image and by a ray, cut, judgement, undo, record and replay; files and refusals."""
+"""A resection in a rehearsal: marks, cut, judgement, undo, record and replay; files and refusals."""
 
 import gc
 import json
@@ -128,7 +128,8 @@ def test_a_cut_keeps_the_margin_and_undo_brings_all_back_bit_for_bit(rehearsal, 
     resected(rehearsal, marks)
     made, judged, report = anatomy.cut, anatomy.judgement, report_of(anatomy)
     assert set(KEYS) <= set(report)
-    # The line is half a millimetre wider, and distances of the hull of the tumour's vertices are shorter by their chords.
+    # The line is half a millimetre wider, and distances of the hull of the tumour's vertices are shorter by
+    # their chords.
     assert MARGIN_MM - 0.1 < report["margin_min_mm"] <= report["margin_mean_mm"] < MARGIN_MM + 0.6
     assert report["positive_margin_mm2"] == report["tumour_left_ml"] == 0.0 and anatomy.tumour is None
     assert abs(report["margin_min_as_cut_mm"] - report["margin_min_mm"]) < 0.5
@@ -271,7 +272,7 @@ def test_the_papers_model_cannot_be_cut_and_says_so(patient, rehearsal, marks):
 
 
 def replayed(rehearsal: Rehearsal, log: Log, at_s: float) -> tuple[int, ReplayCheck]:
-    """Replay a session from the last whole state before a time [s]; the place of the first command, and the comparison."""
+    """Replay from the last whole state before a time [s]; the place of the first command, the comparison."""
     rehearsal.reset()
     replay, check = Replay(log, one_by_one=True), ReplayCheck(log, Notices())
     rehearsal.do(*replay.begin(rehearsal.frame.positions, at_s))
@@ -354,7 +355,7 @@ def test_cuts_that_are_undone_leave_no_fields_and_a_cut_survives_as_text(rehears
 
 
 def test_the_distance_of_a_line_to_the_tumour_is_negative_over_it():
-    """Along the line's outward direction, here z: a point over the middle of a cube of 10 mm, one over its edge, and two beside it."""
+    """Along the line's direction, z: points over the middle and the edge of a cube, and two beside it."""
     line = SimpleNamespace(
         frame=lambda: np.eye(3), points=np.array([[0.0, 0, 9], [5, 0, 9], [8, 0, 9], [8, 9, 9]])
     )

@@ -45,7 +45,7 @@ def surrogate_of(probe) -> tuple[RigidSurrogate, Coverage]:
 
 
 def path_over_the_tumour(length: float) -> np.ndarray:
-    """Poses whose faces are 1, 3 and 0.5 mm in the ball, the second tilted and the third turned; one above it, and one beside it."""
+    """Poses 1, 3 and 0.5 mm in the ball, the second tilted, the third turned; one above, one beside."""
     faces = np.array([[0, 0, R - 1], [0, -4, R - 3], [3, 0, R - 0.5], [0, 5, R + 3]])
     down = np.stack([pose_at(face, -Z, X, length) for face in faces])
     down[1] = tilted(down[1], length, 12.0)

@@ -72,6 +72,9 @@ def test_figures_are_those_of_tissue_that_is_there(lost):
     assert f"speed     {speed}" in summary(tally.report(later, "cpu"))
     assert "parts     tumour 60 kPa (nu 0.4)" in summary(report)
     (press,) = (line for line in summary(report).splitlines() if line.startswith("press"))
-    figures = "indentation 3.50 mm at most, force 0.50 N at most; least volume 97.0 %; penetration at most 0.250 mm; all finite"
+    figures = (
+        "indentation 3.50 mm at most, force 0.50 N at most; least volume 97.0 %; "
+        "penetration at most 0.250 mm; all finite"
+    )
     gone = "NOT FINITE: the tissue diverged, and there are no figures of it"
     assert press.removeprefix("press").strip() == (figures if lost is None else gone)

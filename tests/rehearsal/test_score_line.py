@@ -35,8 +35,8 @@ def test_the_line_is_made_of_great_circles(count):
     line = score_line(ORGAN, circle(count))
     # Neighbours are apart by an arc whose chord is 2 R sin(angle) sin(pi / n).
     exact = count * 2 * R * np.arcsin(np.sin(ANGLE) * np.sin(np.pi / count))
-    # Lengths on the faces, inside the ball by a share s, are shorter by s and at edges longer by as much; points 1 mm apart cut off
-    # corners by 1 mm at each mark at most, as far as the path turns there.
+    # Lengths on the faces, inside the ball by a share s, are shorter by s and at edges longer by as much;
+    # points 1 mm apart cut off corners by 1 mm at each mark at most, as far as the path turns there.
     turned = 2 * np.pi - exact / R if count > 3 else np.pi
     assert abs(line.length_mm / exact - 1) < 2 * inset(ORGAN) + SPACING_MM * turned / exact / 2
     on_ball = np.linalg.norm(line.points, axis=1)
@@ -46,7 +46,8 @@ def test_the_line_is_made_of_great_circles(count):
 def test_its_direction_is_out_of_the_organ_whichever_way_round_the_marks_are():
     for marks in (circle(), circle()[::-1]):
         line = score_line(ORGAN, marks)
-        # The marks are on a circle; the faces that carry them tilt it by less than the faces' own distance from the ball.
+        # The marks are on a circle; the faces that carry them tilt it by less than the faces' own distance
+        # from the ball.
         assert line.direction @ [0, 0, 1] > 1 - inset(ORGAN)
         frame = line.frame()
         np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-12)
@@ -209,8 +210,8 @@ def test_the_proposed_line_is_around_tumour_and_margin(margin_mm):
     marks = marks_around(ORGAN, tumour, margin_mm, up)
     aside = np.linalg.norm(marks - np.outer(marks @ up, up), axis=1)
     wanted = 8.0 + margin_mm + 0.5
-    # Tumour and hull are polyhedra: inside by the mesh, and 5 % of margin and slack farther out at most; an organ's face is not quite
-    # below the ray, by its own distance from the ball.
+    # Tumour and hull are polyhedra: inside by the mesh, and 5 % of margin and slack farther out at most; an
+    # organ's face is not quite below the ray, by its own distance from the ball.
     assert wanted - 8 * inset(ball(8.0)) - 0.05 < aside.min()
     assert aside.max() < wanted + 0.05 * (margin_mm + 0.5) + 0.05
     assert (marks @ up > 0).all()

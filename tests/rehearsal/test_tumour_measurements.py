@@ -1,4 +1,4 @@
-"""The measurements of an anatomy: a ball in a ball, and outlines whose place in the picture is known by hand."""
+"""Measurements of an anatomy: a ball in a ball, and outlines whose place in the picture is known by hand."""
 
 from types import SimpleNamespace
 
@@ -27,7 +27,7 @@ def posed(face=(0.0, 0.0, 40.0), probe=LINEAR) -> np.ndarray:
 def anatomy_of(
     organ=None, tumour=None, shift=(0, 0, 0), now=None, pose=None, probe=LINEAR, outline=NOWHERE, wrench=None
 ) -> SimpleNamespace:
-    """What is measured of an anatomy: an organ at rest, or deformed as ``now``, and a tumour that has shifted."""
+    """What is measured: an organ at rest, or deformed as ``now``, and a tumour that has shifted."""
     organ = organ or ball(30.0)
     return SimpleNamespace(
         case=SimpleNamespace(size_mm=np.array(probe.housing_mm)),
@@ -78,12 +78,14 @@ def test_from_the_face_to_the_tumour(name, at):
         pose=turned @ posed((0, 0, 12), probe),
         organ=ball(100.0),
     )
-    # The nearest point of the face, on the arc that it has along x; of so many that the nearest is told by looking.
+    # The nearest point of the face, on the arc that it has along x; of so many that the nearest is told by
+    # looking.
     half = np.array(probe.housing_mm[:2]) / 2
     x, y = np.linspace(-half[0], half[0], 20_001), np.clip(at[1], -half[1], half[1])
     z = 12 + (probe.radius_mm and probe.radius_mm - np.sqrt(probe.radius_mm**2 - x**2))
     true = np.sqrt((x - at[0]) ** 2 + (y - at[1]) ** 2 + (z - at[2]) ** 2).min() - 4
-    # The face's places are 0.77 mm apart at most, so it ends 0.4 mm beyond the last of them; facets lie 0.5 % in.
+    # The face's places are 0.77 mm apart at most, so it ends 0.4 mm beyond the last of them; facets lie 0.5 %
+    # in.
     assert true - 1e-3 < found.to_tumour_mm < true + 0.02 + np.hypot(0.4, 0.4)
     if abs(at[0]) < half[0] - 1 and abs(at[1]) < half[1] - 1 and probe.radius_mm == 0:
         # Over it, half a place aside costs its square.
@@ -159,8 +161,9 @@ def test_a_square_in_a_linear_picture(u, v, in_view, margin):
 def test_an_outline_is_weighed_by_its_length():
     outline = square(18, 20)
     out = outline.mean(axis=1)[:, 0] > 20
-    halves = np.concatenate([outline[~out], *(np.stack([outline[out, 0] + a * d, outline[out, 0] + b * d], axis=1)
-                             for d in [outline[out, 1] - outline[out, 0]] for a, b in ((0, 0.5), (0.5, 1)))])  # fmt: skip
+    start, run = outline[out, 0], outline[out, 1] - outline[out, 0]
+    halved = [np.stack([start + a * run, start + b * run], axis=1) for a, b in ((0, 0.5), (0.5, 1))]
+    halves = np.concatenate([outline[~out], *halved])
     assert len(halves) > len(outline)
     assert seen(LINEAR, halves)[0] == pytest.approx(0.6)
 
@@ -177,7 +180,7 @@ def test_a_plane_that_misses_the_tumour_shows_none_of_it():
 
 
 def sector(first: float, last: float, near: float, far: float) -> np.ndarray:
-    """Between two angles [degrees] and two depths [mm] of the curvilinear probe: arcs of 1 degree, radii of 1 mm."""
+    """Between angles [degrees] and depths [mm] of the curvilinear probe: arcs of 1 degree, radii of 1 mm."""
     angles, depths = np.radians(np.arange(first, last + 0.5)), np.arange(near, far + 0.5)
 
     def polar(angle, depth):
@@ -197,12 +200,14 @@ def sector(first: float, last: float, near: float, far: float) -> np.ndarray:
 @pytest.mark.parametrize(
     "first, last, near, far, in_view, margin",
     [
-        # The first radial segment's middle is 20.5 deep: 80.5 mm from where the lines leave, 5 degrees from the last.
+        # The first radial segment's middle is 20.5 deep: 80.5 mm from where the lines leave, 5 degrees from
+        # the last.
         (-5, 25, 20, 40, 1.0, 80.5 * np.radians(5)),
         (-25, 5, 20, 40, 1.0, 80.5 * np.radians(5)),
         # An arc's chord is nearer by 1 - cos(0.5 degrees) of 175 mm.
         (-5, 5, 100, 115, 1.0, 120 - (175 * np.cos(np.radians(0.5)) - 60)),
-        # Arcs of radius 80 and 100: 10 degrees of 15 in, and one radius of 20 mm of two. Out by 5 degrees of the farthest, at 39.5.
+        # Arcs of radius 80 and 100: 10 degrees of 15 in, and one radius of 20 mm of two. Out by 5 degrees of
+        # the farthest, at 39.5.
         (20, 35, 20, 40, None, -99.5 * np.radians(5)),
         (-35, -20, 20, 40, None, -99.5 * np.radians(5)),
     ],
@@ -215,7 +220,8 @@ def test_a_piece_of_a_sector_in_a_curvilinear_picture(first, last, near, far, in
 
 
 def test_a_curvilinear_picture_ends_behind_its_face():
-    # Of 12 degrees each side: arcs of radius 54 and 66 mm, two radii of 12 mm, the half of them behind the face.
+    # Of 12 degrees each side: arcs of radius 54 and 66 mm, two radii of 12 mm, the half of them behind the
+    # face.
     in_view = (66 * 24 * 2 * np.sin(np.radians(0.5)) + 12) / (120 * 24 * 2 * np.sin(np.radians(0.5)) + 24)
     # Behind the face lines are taken to be as far apart as on it.
     assert seen(CURVED, sector(-12, 12, -6, 6)) == pytest.approx((in_view, 60 * np.radians(18)))

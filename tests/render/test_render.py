@@ -13,7 +13,6 @@ import pytest
 import taichi as ti
 import trimesh
 from conftest import ROOT
-from null_viewer import NullViewer
 
 from render import background_image, display, transducer_shape, ultrasound_panel
 from render.camera import OrbitCamera
@@ -21,7 +20,7 @@ from render.cut_face import FLESH
 from render.display import display_available, fitted, scale_of, window_size
 from render.sliders import boxes_of, draw_sliders
 from render.software_scene import SoftwareScene
-from render.viewer import Controls, Geometry, Settings, View
+from render.viewer import Geometry, Settings, View
 from render.warning_box import warning_image, warning_rect
 from render.window_layout import FULL_SIZE, RULER_WIDTH, WindowLayout
 from sim.device import start
@@ -215,20 +214,6 @@ def test_segments_are_drawn_where_they_are_and_nowhere_else():
 
 
 # Front ends
-
-
-def test_null_viewer_drives_a_loop():
-    settings = Settings(stiffness=0.4)
-    script = [Controls(settings, push_mm=1.0), None, Controls(settings, quit=True)]
-    viewer = NullViewer(settings, script)
-    pushed = 0.0
-    while viewer.running:
-        controls = viewer.read_controls()
-        pushed += controls.push_mm
-        assert controls.settings.stiffness == 0.4
-        viewer.draw(_view())
-    assert (viewer.frames, pushed) == (3, 1.0)
-    assert viewer.picture().shape == (720, 1280, 3)
 
 
 ORGAN_MM = 22.0

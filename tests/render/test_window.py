@@ -22,11 +22,13 @@ pytestmark = pytest.mark.skipif(
     not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Xvfb and xdotool"
 )
 START_S, REST_S = 120, 90
-# How long a picture is waited for before its key is pressed again, and how far apart two pictures are at least.
+# How long a picture is waited for before its key is pressed again, and how far apart two pictures are at
+# least.
 ASK_S, APART_S = 2.0, 0.5
 # A small screen, so that its window is drawn fast without a graphics card.
 SCREEN, WINDOW = "640x480x24", (640, 360)
-# The slice and what is drawn of organ and transducer, and how much two pictures of a still one differ at most.
+# The slice and what is drawn of organ and transducer, and how much two pictures of a still one differ at
+# most.
 PANEL, SCENE = np.s_[70:310, 400:620], np.s_[40:240, 10:360]
 STILL = 0.5
 # Two points on the B-mode image beside the CT.
@@ -215,6 +217,6 @@ def test_the_mouse_moves_and_presses_the_transducer(screen):
     screen.do("key", "--window", screen.window, "Escape")
     assert screen.program.wait(timeout=20) == 0
     lines = (screen.out / "session-001.jsonl").read_text().splitlines()
-    events = [event for line in lines for event in json.loads(line).get("events", [])]
-    marks = [event["value"] for event in events if event["kind"] == "marks"]
-    assert [len(each) for each in marks] == [1, 2, 3], "a click with shift sets no mark"
+    commands = [json.loads(line).get("command", {}) for line in lines]
+    marks = [len(command["places_mm"]) for command in commands if command.get("kind") == "mark"]
+    assert marks == [1, 1, 1], "a click with shift sets no mark"

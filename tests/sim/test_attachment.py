@@ -1,4 +1,4 @@
-"""Fixed boundary: tissue near the hilum does not move, the rest deforms; without attachment no node is fixed."""
+"""Fixed boundary: tissue at the hilum does not move, the rest deforms; otherwise no node is fixed."""
 
 import numpy as np
 import pytest
@@ -96,14 +96,15 @@ def drop_mm(organ: PressedOrgan) -> tuple[float, float]:
 
 
 def test_a_pedicles_tether_stretches_by_the_weight_over_its_stiffness(device):
-    # It reaches all but the farthest tissue, so that the ball neither turns nor deforms by more than a hundredth of the sag.
+    # It reaches all but the farthest tissue, so that the ball neither turns nor deforms by more than a
+    # hundredth of the sag.
     sag, weight_n = drop_mm(spring_scene(at_mm=(0.0, 0.0, 0.0), radius_mm=15.0, stiffness_n_mm=0.05))
     assert sag == pytest.approx(weight_n / 0.05, rel=0.02) and sag > 2
 
 
 def test_fat_is_a_foundation_on_the_covered_half_of_the_surface(device):
-    # On half a ball of radius R and stiffness k per area: 2 pi R^2 k in all. Its springs are in the covered half, which
-    # turns the ball a little; the centre of mass sinks by the weight over that stiffness.
+    # On half a ball of radius R and stiffness k per area: 2 pi R^2 k in all. Its springs are in the covered
+    # half, which turns the ball a little; the centre of mass sinks by the weight over that stiffness.
     organ = spring_scene(fat_kpa_mm=0.05)
     stiffness = array_of(organ.model.tether) / 1e6
     assert stiffness.sum() == pytest.approx(2 * np.pi * 15.0**2 * 0.05e-3, rel=0.03)
@@ -140,7 +141,7 @@ def test_a_deeper_hollow_of_the_other_side_is_no_hilum():
 
 
 def test_the_embedded_kidneys_hilum(phantom_hilum):
-    """Where its vessels leave it: scenes/phantom/kidney.py puts its sinus 7 mm to the midline of the kidney's middle."""
+    """Where its vessels leave it: scenes/phantom/kidney.py puts its sinus 7 mm to the midline."""
     organ, found = phantom_hilum
     vessels = organ.parts["vessel"]
     leaving = vessels.vertices[vessels.vertices[:, 0] < vessels.bounds[0, 0] + 3].mean(axis=0)

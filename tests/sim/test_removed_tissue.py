@@ -1,4 +1,4 @@
-"""A ball's lattice, points and membrane after a cut, against the volumes and areas of what remains; restored to the same bits."""
+"""A ball's lattice, points and membrane after a cut have what remains; undo restores the same bits."""
 
 from dataclasses import fields
 
@@ -56,8 +56,9 @@ def lattice(tissue) -> Lattice:
 def missing(tissue: RemovedTissue) -> float:
     """The largest error of the volume of the tissue that remains [mm^3].
 
-    A cell's filled part is that of 6 x 6 x 6 samples, each with a linear share over its own width h: on a plane it is exact, on an
-    edge between capsule and bed it is off by some h^2 of an edge's section, along its length; and that of the whole lattice.
+    A cell's filled part is that of 6 x 6 x 6 samples, each with a linear share over its own width h: on a
+    plane it is exact, on an edge between capsule and bed it is off by some h^2 of an edge's section, along its
+    length; and that of the whole lattice.
     """
     h = CELL_MM / 6
     edge = 2 * np.pi * 15.0
@@ -80,7 +81,7 @@ def test_the_tissue_has_the_volume_and_the_centre_of_what_remains(tissue, lattic
 
 
 def test_a_cell_has_the_centre_of_its_own_tissue(tissue, lattice):
-    """The corners' shares of a cell's tissue say where its centre is: within the cell, and below the plane of a cut."""
+    """The corners' shares of a cell's tissue say where its centre is: in the cell, and below the cut."""
     is_filled = lattice.volume > 0
     share = lattice.tissue[is_filled] / lattice.tissue[is_filled].sum(axis=1, keepdims=True)
     centre = np.einsum("mn,mna->ma", share, lattice.nodes[lattice.cells[is_filled]])
@@ -161,7 +162,8 @@ def test_points_of_removed_tissue_go_to_the_new_surface(tissue):
     )[0]
     assert apart.max() < 1e-12
     assert left[gone].sum() == pytest.approx(new.area, rel=1e-9)
-    # A point at the edge stands for a piece of the capsule of which a part is removed: half a spacing on each side.
+    # A point at the edge stands for a piece of the capsule of which a part is removed: half a spacing on each
+    # side.
     edge = 2 * np.pi * 18.0 * spacing
     assert left.sum() == pytest.approx(tissue.remaining.area, abs=edge)
 
@@ -182,7 +184,7 @@ def test_more_points_than_needed_have_no_area_and_fewer_are_farther_apart():
 
 @pytest.mark.parametrize("radius", [0.9, 0.3])
 def test_a_hole_with_more_sides_than_it_takes_points_keeps_its_area(one_device, radius):
-    """Its walls face six directions, and its mouth takes three points of the capsule or none: as many stay."""
+    """Its walls face six directions, and its mouth takes three points of the capsule or none: all stay."""
     hole = trimesh.creation.box([2 * radius, 2 * radius, 40.0]).apply_translation([0.3, 0.4, 28.0])
     narrow = tissue_of(cut_by(ORGAN, hole))
     points, area = surface_points(ORGAN, CELL_MM / 2)
@@ -293,7 +295,7 @@ def test_the_steps_after_undo_and_redo_give_the_same_bits(patient):
 
 
 def test_the_corners_share_is_the_shape_function_at_the_centre_of_the_tissue(one_device):
-    """Below the plane z = 11 a cell between 10.x and 14.x keeps its lower part: its centre is amid that part."""
+    """Below the plane z = 11 a cell between 10.x and 14.x keeps its lower part, with its centre amid it."""
     cut = tissue_of(cut_by(ORGAN, CUTTERS["plane"]))
     lattice = lattice_without(WHOLE, cut, [PART])
     low = WHOLE.nodes[WHOLE.cells][:, 0]
@@ -303,6 +305,7 @@ def test_the_corners_share_is_the_shape_function_at_the_centre_of_the_tissue(one
     share = lattice.tissue[crossed] / lattice.tissue[crossed].sum(axis=1, keepdims=True)
     part = height[crossed] / CELL_MM
     middle = np.column_stack([np.full((len(part), 2), 0.5), part / 2])
-    # The layer of samples at the plane is filled by its share, and counts at its own middle: h^2 / 8 of a cell.
+    # The layer of samples at the plane is filled by its share, and counts at its own middle: h^2 / 8 of a
+    # cell.
     np.testing.assert_allclose(share, shape_functions(middle), atol=1 / 6**2 / 4 / part.min())
     np.testing.assert_allclose(lattice.tissue[crossed].sum(axis=1), CELL_MM**3 * part, rtol=1e-6)

@@ -1,4 +1,4 @@
-"""Sweeps with the truth beside them: as they are recorded, and what ``reconstruct`` makes of them and of PLUS's."""
+"""Sweeps with the truth beside them as they are recorded, and what ``reconstruct`` makes of sweeps."""
 
 import io
 import json
@@ -246,7 +246,7 @@ def test_a_probe_is_held_where_its_image_plane_is():
 
 
 def still_rehearsal() -> tuple[SimpleNamespace, list[np.ndarray]]:
-    """What the correction asks of a rehearsal whose tissue never moves, and the poses that its probe takes."""
+    """What the correction asks of a rehearsal whose tissue never moves, and the poses of its probe."""
     probe = load_probe("curvilinear").model_copy(update=dict(housing_mm=(40.0, 10.0, 20.0)))
     organ = SimpleNamespace(pose=np.eye(4), settings=SimpleNamespace(time_step_s=1 / 60))
     poses: list[np.ndarray] = []
@@ -307,7 +307,7 @@ def swept(tmp_path_factory) -> Path:
 
 
 def test_a_sweep_is_described_by_its_steps_and_speeds():
-    """Steps of 3, 12 and 5 mm, in 0.5, 1 and 2 s; the image of the third frame, on the way of 12 mm, was not tracked."""
+    """Steps of 3, 12 and 5 mm in 0.5, 1 and 2 s; the third frame, on the way of 12 mm, was not tracked."""
     times = (7.0, 7.5, 8.0, 8.5, 10.5)
     frames = [dict(Timestamp=str(time)) for time in times]
     sweep = Sweep(np.zeros((5, 2, 2), np.uint8), frames, {})
@@ -336,7 +336,8 @@ def test_a_sweep_is_described_by_its_steps_and_speeds():
     assert in_words(report).splitlines() == [
         "images    4 of 5 with a pose, 5.00 mm apart (median; at most 12.00), 6 mm/s",
         "volume    30 x 40 x 50 voxels of 0.5 mm, smooth, compression corrected",
-        "organ     23 % scanned; only in this small part Dice 0.912, HD95 1.25 mm, volume -3.5 %, centroid 0.57 mm off",
+        "organ     23 % scanned; only in this small part Dice 0.912, HD95 1.25 mm, volume -3.5 %, "
+        "centroid 0.57 mm off",
         "tumour    88 % scanned; in this part nothing found",
     ]
 
