@@ -16,7 +16,7 @@ from conftest import ROOT
 
 import app
 from rehearsal.planning.plan_file import Plan, PlannedSweep
-from rehearsal.sessions.session_file import End, Event, Header, Second
+from rehearsal.sessions.session_file import LINES, Header
 from rehearsal.tracking.pose_file import load_poses, load_timed_poses
 from scenes.import_findings import GridFindings, ImportFindings, ImportWarning, SurfaceFindings
 from scenes.scene import Image, Scene, Trocar
@@ -290,7 +290,7 @@ def section(heading: str) -> set[str]:
     ("heading", "models"),
     [
         ("Scene", [NeoHookeanTissue, ShapeMatchingTissue, Trocar]),
-        ("Session", [Header, Event, Second, End]),
+        ("Session", [Header, *LINES.values()]),
         ("Plan", [Plan, PlannedSweep]),
         ("Findings of an import", [ImportFindings, ImportWarning, GridFindings, SurfaceFindings]),
     ],
