@@ -35,8 +35,8 @@ BEAD_RADIUS_MM, BEADS_APART_MM, BEADS_WITHIN_MM = 1.5, 9.0, 24.0
 class GroundTruthSweep:
     """A sweep of ``PixelLabel`` images with the true poses (n, 4, 4) of the probe in the patient.
 
-    ``beads_mm`` (k, 3) are at rest (LPS), ``on_probe`` (4, 4) is ImageToProbe, ``mask`` (rows, columns) is True
-    in the field of view.
+    ``beads_mm`` (k, 3) are at rest (LPS), ``on_probe`` (4, 4) is ImageToProbe, ``mask`` (rows, columns) is
+    True in the field of view.
     """
 
     sweep: Sweep

@@ -143,7 +143,7 @@ def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
 
 
 class FeatureBody:
-    """A scene's organ and support for solvers with different features, relative to the organ's middle [mm]."""
+    """A scene's organ and support for solvers with other features, relative to the organ's middle [mm]."""
 
     def __init__(self, scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str) -> None:
         start(arch)

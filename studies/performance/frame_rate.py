@@ -217,7 +217,8 @@ def summary(figures: dict[str, Any]) -> str:
     return "\n".join(
         [
             f"pictures  {figures['frames_per_s']:.1f} a second in a window of {width} x {height} "
-            f"({drivers}), real-time factor {figures['real_time_factor']:.3f}, over {figures['seconds']:.0f} s",
+            f"({drivers}), real-time factor {figures['real_time_factor']:.3f}, "
+            f"over {figures['seconds']:.0f} s",
             f"latency   {latency['median']:.0f} ms from an input to its picture, "
             f"95 % within {latency['p95']:.0f} ms",
             f"frame     medians in ms: {stages}",

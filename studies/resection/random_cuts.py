@@ -112,7 +112,7 @@ def surface_faults(cut: Cut, organ: trimesh.Trimesh) -> list[str]:
 
 
 def volume_change(anatomy: DeformedAnatomy, cut: Cut) -> float:
-    """Relative change of volume since the cut: from the whole organ then to remnant now and specimen as cut."""
+    """Relative change of volume since the cut: whole organ then, remnant now and specimen as cut."""
     remnant = volume_mm3(anatomy.vertices, cut.remnant.faces)
     specimen, organ = (
         volume_mm3(anatomy.carried_then(np.asarray(each.vertices)), each.faces)

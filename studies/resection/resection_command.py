@@ -73,8 +73,8 @@ Part = tuple[str, dict[str, Any]]
 def resection(patients: tuple[Path, ...], out: Path, chosen: tuple[str, ...], cuts: int, seed: int) -> None:
     """Measure margins, balance, random cuts and times of the resection.
 
-    Of the embedded patient, and of further patients' folders. The finite elements of the balance take ten minutes
-    the first time.
+    Of the embedded patient, and of further patients' folders. The finite elements of the balance take
+    ten minutes the first time.
     """
     make_folder(out)
     loaded: list[Patient] = [("embedded", *load_patient(EMBEDDED))]

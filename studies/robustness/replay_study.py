@@ -154,8 +154,9 @@ def replayed(rehearsal: Rehearsal, log: Log, from_s: float, bar: tqdm) -> dict[s
 def summary(figures: dict[str, Any]) -> str:
     """The session and its replays, a line each."""
     lines = [
-        f"recorded  {figures['minutes']:g} minutes, {figures['moments']} steps, {figures['ways_back']} of them "
-        f"undone, redone, reset or returned to a bookmark; {figures['megabytes']:.1f} MB in {figures['file']}; "
+        f"recorded  {figures['minutes']:g} minutes, {figures['moments']} steps, {figures['ways_back']} of "
+        f"them undone, redone, reset or returned to a bookmark; {figures['megabytes']:.1f} MB "
+        f"in {figures['file']}; "
         f"final state {figures['digest']}"
     ]
     for run in figures["replays"]:

@@ -44,7 +44,7 @@ class Unknown:
 
 
 def with_all_parts(scene: Scene, anatomy: LoadedAnatomy) -> Scene:
-    """The scene where each part with a surface has its own material: the scene's, or what is typical of it."""
+    """The scene; each part with a surface has its own material: the scene's, or what is typical of it."""
     assert isinstance(scene.tissue, NeoHookeanTissue)
     present = {*anatomy.parts, *(() if anatomy.tumour is None else ("tumour",))}
     typical = {name: PartMaterial() for name in get_args(PartName) if name in present}
