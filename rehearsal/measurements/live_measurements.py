@@ -83,6 +83,7 @@ class LiveMeasurements:
                 "another body"
             )
         self.coverage.seen = seen
+        time_s = 0.0
         for number, command in log.commands:
             if number >= until:
                 break
@@ -93,9 +94,12 @@ class LiveMeasurements:
             if isinstance(command, Move):
                 if self.guide is not None:
                     self.guide.follow(command.pose)
-                self.count(command.pose, command.length_s or log.header.time_step_s)
+                length_s = command.length_s or log.header.time_step_s
+                self.count(command.pose, length_s)
+                time_s += length_s
             elif command.kind in RESTORES:
                 self.count(None, 0.0)
+        self._covered, self._measured = periods(time_s, COVERAGE_S), periods(time_s, MEASURE_S)
         self._show()
         return True
 
