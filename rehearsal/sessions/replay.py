@@ -229,5 +229,3 @@ def open_session(
         frame = apply(commands)
         for observer in observers:
             observer.observe(frame, probe_with_settings(anatomy.case.probe, settings))
-    # Its events were observed.
-    anatomy.show(stepper.newest())

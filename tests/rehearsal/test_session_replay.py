@@ -99,7 +99,9 @@ def files_of(rehearsal: Rehearsal, **named: Any) -> AskedFiles:
     return AskedFiles(Path(), rehearsal.case.scene, rehearsal.case.probe, Keys(), **named)
 
 
-def run_of(rehearsal: Rehearsal, loaded: LoadedAnatomy, asked: RehearseOptions, files: AskedFiles, viewer=None):
+def run_of(
+    rehearsal: Rehearsal, loaded: LoadedAnatomy, asked: RehearseOptions, files: AskedFiles, viewer=None
+):
     """A run whose steps are made in this process."""
     model = rehearsal.organ.model
     shown = rehearsal.anatomy, rehearsal.stepper, rehearsal.manipulator
