@@ -8,7 +8,7 @@ import numpy as np
 from tqdm import tqdm
 
 from rehearsal.deformed_anatomy import DeformedAnatomy
-from rehearsal.loop.command import Bookmark, Checkpoint, Command, Load, Move, SetValues
+from rehearsal.loop.command import Bookmark, Checkpoint, Command, Load, SetValues
 from rehearsal.loop.frame import Digest, Frame, Refused
 from rehearsal.loop.history import History
 from rehearsal.loop.observer import Observer

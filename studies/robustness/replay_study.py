@@ -137,7 +137,7 @@ def replayed(rehearsal: Rehearsal, log: Log, from_s: float, bar: tqdm) -> dict[s
     rehearsal.do(*replay.begin(rehearsal.frame.positions, from_s))
     begins_s = replay.time_s
     # The steps from there to the time itself are not counted.
-    bar.update(-replay.moves_until(log.place_at(from_s)))
+    bar.update(-replay.frames_until(log.place_at(from_s)))
     for commands in replay.until(log.length_s):
         frame = rehearsal.do(*commands)
         replay.check(frame)
