@@ -173,9 +173,9 @@ class RehearsalRun:
             run_headless(loop, steps, self.arch, self.asked.out, draws, self.files.resection_plan, about)
 
     def _observers(self, announcements: Announcements, check: ReplayCheck | None) -> list[Observer]:
-        """Those of each frame, in this order: a new session is recorded before it is measured."""
+        """Those of each frame, in this order: beside a whole state the coverage is recorded, with the image of that state."""
         self.recording = Recording(self, is_replay=check is not None)
-        observers: list[Observer] = [self.recording, self.measurements, announcements]
+        observers: list[Observer] = [self.measurements, self.recording, announcements]
         return observers if check is None else [*observers, check]
 
     def _about_patient(self) -> dict[str, Any]:

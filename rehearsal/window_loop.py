@@ -57,7 +57,8 @@ class WindowLoop:
 
     def run(self) -> None:
         """Draw frames until the window is closed."""
-        frame, view = self.anatomy.frame, None
+        # Its events were observed where it was shown.
+        frame, view = replace(self.anatomy.frame, events=()), None
         probe = self.anatomy.case.probe
         while self.window.running:
             controls = self._controls()

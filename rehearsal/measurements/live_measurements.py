@@ -8,7 +8,7 @@ import numpy as np
 
 from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.loop.command import Move
-from rehearsal.loop.frame import Frame
+from rehearsal.loop.frame import Applied, Frame, Step
 from rehearsal.loop.timeline import periods
 from rehearsal.measurements.session_summary import SessionCourse
 from rehearsal.measurements.tumour_measurements import Measurement, measure
@@ -83,6 +83,7 @@ class LiveMeasurements:
                 "another body"
             )
         self.coverage.seen = seen
+        time_s = 0.0
         for number, command in log.commands:
             if number >= until:
                 break
@@ -93,9 +94,12 @@ class LiveMeasurements:
             if isinstance(command, Move):
                 if self.guide is not None:
                     self.guide.follow(command.pose)
-                self.count(command.pose, command.length_s or log.header.time_step_s)
+                length_s = command.length_s or log.header.time_step_s
+                self.count(command.pose, length_s)
+                time_s += length_s
             elif command.kind in RESTORES:
                 self.count(None, 0.0)
+        self._covered, self._measured = periods(time_s, COVERAGE_S), periods(time_s, MEASURE_S)
         self._show()
         return True
 
@@ -138,10 +142,11 @@ class LiveMeasurements:
             self.latest = measure(self.anatomy, probe, self._touches)
             self.note(frame.number, self.figures())
             self._show()
-        for step in frame.steps:
-            self.count(step.pose, step.length_s)
-        for _ in frame.restored:
-            self.count(None, 0.0)
+        for event in frame.events:
+            if isinstance(event, Step):
+                self.count(event.pose, event.length_s)
+            elif isinstance(event, Applied) and event.restored is not None:
+                self.count(None, 0.0)
 
     def count(self, pose: np.ndarray | None, length_s: float) -> None:
         """Count a step by its pose (4, 4) and its length [s], or a rollback by None, for the summary."""

@@ -18,7 +18,7 @@ from rehearsal.loop.timeline import SETTLED
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.notices import Notices
 from rehearsal.sessions.packed_arrays import StateError, unpack_state
-from rehearsal.sessions.session_file import ROUNDING_S, Log, SessionError, history_after
+from rehearsal.sessions.session_file import ROUNDING_S, Log, SessionError, history_after, makes_state
 from rehearsal.settings import probe_with_settings, set_settings
 from render.viewer import Controls, Settings
 from ultrasound.probe import Probe
@@ -28,7 +28,7 @@ MOST_DUE_S = 0.25
 
 
 class Replay:
-    """A ``Source``: the commands of a log in real time, or ``one_by_one``, with a move for each frame.
+    """A ``Source``: the commands of a log in real time, or ``one_by_one``, with a state for each frame.
 
     ``place`` is the index of the next command. Raises SessionError where the log's states belong to another body.
     """
@@ -95,6 +95,10 @@ class Replay:
             before_s = self.time_s
             yield from self._next()
             self._due_s -= self.time_s - before_s
+            if self.time_s == before_s:
+                # What a command restores has a frame of its own, which takes its time.
+                self._due_s = 0.0
+                return
 
     def check(self, frame: Frame) -> None:
         """Raises SessionError where a command of the log was refused."""
@@ -113,11 +117,11 @@ class Replay:
     def frames_until(self, place: int) -> int:
         """How often ``commands`` gives what comes before the command of a place, ``one_by_one``."""
         commands = self.log.commands[self.place : place]
-        moves = sum(isinstance(command, Move) for _, command in commands)
-        return moves + (len(commands) > 0 and not isinstance(commands[-1][1], Move))
+        states = sum(makes_state(command) for _, command in commands)
+        return states + (len(commands) > 0 and not makes_state(commands[-1][1]))
 
     def _next(self, last: int | None = None) -> Iterator[Command]:
-        """The commands up to the next move."""
+        """The commands up to the next state."""
         commands = self.log.commands
         last = len(commands) if last is None else last
         while self.place < last:
@@ -125,7 +129,7 @@ class Replay:
             self.place += 1
             self.bookmarks += isinstance(command, Bookmark)
             yield command
-            if isinstance(command, Move):
+            if makes_state(command):
                 break
         if self.is_over:
             # As at the end of the recording.

@@ -41,7 +41,7 @@ class PatientResult:
 
 
 def run_patient(key: str, problem: PlanningProblem, trials: int) -> PatientResult:
-    """Settle a patient's organ, make the scene's press, and search a plan with so many trials. Raises UserError."""
+    """Settle a patient's organ, make the scene's press, search a plan. Raises UserError."""
     begin = perf_counter()
     trial = built_once(key, lambda: Trial(problem))
     report = press(trial.rehearsal, perf_counter() - begin)

@@ -1,4 +1,4 @@
-"""The command ``study freehand``: accuracy of volumes reconstructed from tracked sweeps, its table and its figure.
+"""The command ``study freehand``: accuracy of volumes reconstructed from tracked sweeps.
 
 At rest, with a tracker's errors, and under compression.
 """
@@ -173,7 +173,7 @@ def noise_curves(
 def compression(
     scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str, quick: bool, done: Callable[[], Any]
 ) -> list[dict[str, Any]]:
-    """Figures of sweeps pressed over the tumour at several depths, without and with the compression correction."""
+    """Figures of sweeps pressed over the tumour at some depths, without and with compression correction."""
     start(arch)
     small = with_options(scene_of(scene, setup), {"image.pixels": PIXELS})
     radius_mm = FIXED_MM if scene.attachment.at_mm else 0.0
@@ -251,7 +251,7 @@ def _named(row: dict[str, Any]) -> str:
 
 
 def figure_of(runs: list[dict[str, Any]]) -> Figure:
-    """Error against tracking errors and against compression; a colour is a patient, a line style a quantity."""
+    """Error against tracking errors and compression; a colour is a patient, a line style a quantity."""
     figure = Figure(figsize=(13, 9.5), layout="constrained")
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(2, 1.1))[:, 0]
     panels = above.subplots(2, 3).ravel()

@@ -1,4 +1,4 @@
-"""Freehand sweeps with known ground truth: a slow one of the resting kidney, and ones pressed over the tumour."""
+"""Freehand sweeps with known ground truth: a slow one of the resting kidney, ones pressed over the tumour."""
 
 from dataclasses import dataclass
 
@@ -33,9 +33,10 @@ BEAD_RADIUS_MM, BEADS_APART_MM, BEADS_WITHIN_MM = 1.5, 9.0, 24.0
 
 @dataclass
 class GroundTruthSweep:
-    """A sweep of ``PixelLabel`` images with the true poses (n, 4, 4) of the probe in the patient, and the beads (k, 3) at rest (LPS, mm).
+    """A sweep of ``PixelLabel`` images with the true poses (n, 4, 4) of the probe in the patient.
 
-    ``on_probe`` (4, 4) is ImageToProbe, ``mask`` (rows, columns) is True in the field of view.
+    ``beads_mm`` (k, 3) are at rest (LPS), ``on_probe`` (4, 4) is ImageToProbe, ``mask`` (rows, columns) is
+    True in the field of view.
     """
 
     sweep: Sweep
@@ -81,7 +82,7 @@ def resting(
 
 
 def _along(organ: trimesh.Trimesh, probe: Probe, direction: np.ndarray) -> np.ndarray:
-    """Poses (n, 4, 4) along the organ's long axis, with the image planes perpendicular to it and the beam along a direction."""
+    """Poses (n, 4, 4) along the organ's long axis: the beam along a direction, images across the axis."""
     down = direction / np.linalg.norm(direction)
     centred = organ.vertices - organ.center_mass
     axis = np.linalg.svd(centred - np.outer(centred @ down, down), full_matrices=False)[2][0]
@@ -123,7 +124,7 @@ def pressed(rehearsal: Rehearsal, depth_mm: float) -> GroundTruthSweep:
 
 
 def _path(rehearsal: Rehearsal, tumour: trimesh.Trimesh, depth_mm: float) -> np.ndarray:
-    """Poses (n, 4, 4) of each step over the middle of the tumour, at a depth [mm] under the settled surface."""
+    """Poses (n, 4, 4) of each step over the middle of a tumour, at a depth [mm] under the settled surface."""
     manipulator = rehearsal.manipulator
     home = manipulator.home
     local = (np.asarray(tumour.vertices) - home[:3, 3]) @ home[:3, :3]
@@ -155,7 +156,7 @@ def _truth(
 def sweep_of(
     images: np.ndarray, poses: list[np.ndarray | None] | np.ndarray, times_s: np.ndarray, on_probe: np.ndarray
 ) -> Sweep:
-    """A sweep of images (n, rows, columns) and poses of the probe in the patient, None where they were lost."""
+    """A sweep of images (n, rows, columns) and poses of the probe in the patient, None where it was lost."""
     frames = [
         transform_fields("ProbeToReference", pose) | {"Timestamp": repr(float(time_s))}
         for pose, time_s in zip(poses, times_s, strict=True)

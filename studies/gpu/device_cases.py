@@ -1,4 +1,4 @@
-"""What is measured on each backend: presses with known beads, pictures, frames, and blocks of more and more nodes."""
+"""What is measured on each backend: presses with known beads, pictures, frames, blocks of ever more nodes."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rehearsal.deformed_anatomy import DeformedAnatomy
     from ultrasound.scanner import PlaneImages
 
-# A press of the embedded patient's beads, shorter than the paper's: what is compared is one device with another.
+# A press of the embedded patient's beads, shorter than the paper's: one device is compared with another.
 WARM_UP_STEPS, STAGE_STEPS = 60, 30
 PICTURES, FRAMES = 20, 10
 # A processor needs minutes for larger blocks.
@@ -39,8 +39,9 @@ BLOCKS = "blocks at rest"
 
 @dataclass(frozen=True)
 class CaseFigures:
-    """One case on one backend: ``ms`` are mean, spread and median of what is measured, ``first_s`` the time before it, with building
-    and compilation; ``arrays`` are what is compared.
+    """One case on one backend: ``ms`` are mean, spread and median of what is measured.
+
+    ``first_s`` is the time before it, with building and compilation; ``arrays`` are what is compared.
     """
 
     case: str
@@ -55,7 +56,7 @@ Case = Callable[[], Iterator[CaseFigures]]
 
 
 def cases(arch: str) -> dict[str, Case]:
-    """What is measured on a backend, by name, in this order: what a rehearsal needs comes first, as time may run out."""
+    """What is measured on a backend, by name; what a rehearsal needs comes first, as time may run out."""
     presses: dict[str, Case] = {name: partial(press, name, setup) for name, setup in PRESSES.items()}
     rehearsal: dict[str, Case] = {
         "balanced": presses["balanced"],

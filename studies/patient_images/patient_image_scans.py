@@ -28,7 +28,10 @@ AVERAGED_MM = 3.0
 
 @dataclass(frozen=True)
 class PlaneScan:
-    """One standard plane: CT and B-mode image (rows, columns) uint8, whether the scanlines reach a pixel, and the truth."""
+    """One standard plane: CT and B-mode image (rows, columns) uint8, and the truth.
+
+    ``covered`` says whether the scanlines reach a pixel.
+    """
 
     name: str
     pose: np.ndarray

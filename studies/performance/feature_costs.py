@@ -1,4 +1,4 @@
-"""The command ``study features``: the cost of each feature of a scene, by the same press with it and without it, in turn."""
+"""The command ``study features``: the cost of each feature of a scene: the same press with and without."""
 
 from collections.abc import Callable, Iterator
 from functools import cache, partial
@@ -108,7 +108,7 @@ FEATURES = {
     | (OF_ELEMENTS if model == USUAL else {})
     for model, section in TISSUES.items()
 }
-# A ball of this radius in the organ's middle is a tumour [mm]; a term of relaxation: its share and its time [s].
+# Radius of a ball in the organ's middle, a tumour [mm]; a term of relaxation: its share and its time [s].
 PART_MM, TERM = 10.0, (0.5, 1.0)
 
 
@@ -143,7 +143,7 @@ def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
 
 
 class FeatureBody:
-    """A scene's organ and support, for solvers with different features; positions relative to the organ's middle [mm]."""
+    """A scene's organ and support for solvers with other features, relative to the organ's middle [mm]."""
 
     def __init__(self, scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str) -> None:
         start(arch)
@@ -345,7 +345,7 @@ def _added(row: dict[str, Any], name: str) -> float | None:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """What each feature adds: time of a step or of a part of a frame, memory, parallel kernels and their launches."""
+    """What each feature adds: time of a step or part of a frame, memory, parallel kernels and launches."""
     return table_of(COLUMNS.items(), [row | {name: _added(row, name) for name in MEASURED} for row in rows])
 
 

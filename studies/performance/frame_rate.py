@@ -1,4 +1,4 @@
-"""The command ``study frames``: is a rehearsal in a window in real time, and how soon does it show what the hand does?"""
+"""The command ``study frames``: is a window in real time, and how soon does it show what the hand does?"""
 
 from collections import defaultdict
 from collections.abc import Iterable
@@ -61,9 +61,9 @@ class FrameOptions(ImageOptions, QualityOptions, ArchOptions):
 class ScriptedHand:
     """A ``Source``: a script moves the probe by the clock in the user's stead, and quits after some seconds.
 
-    ``times`` are those of the frames after BEGIN_S, of the last ones in a long run; ``load`` is the processor time
-    that the processes have used since then, a second, and ``memory_mb`` what they have had, every MEMORY_EVERY_S.
-    ``home`` (4, 4) is the transducer's pose where it just touches the organ.
+    ``times`` are those of the frames after BEGIN_S, of the last ones in a long run; ``load`` is the processor
+    time that the processes have used since then, a second, and ``memory_mb`` what they have had, every
+    MEMORY_EVERY_S. ``home`` (4, 4) is the transducer's pose where it just touches the organ.
     """
 
     def __init__(self, loop: "WindowLoop", home: np.ndarray, start: StartTimes, seconds: float) -> None:
@@ -216,14 +216,17 @@ def summary(figures: dict[str, Any]) -> str:
     (width, height), drivers = figures["window"], ", ".join(figures["drivers"]) or "driver not known"
     return "\n".join(
         [
-            f"pictures  {figures['frames_per_s']:.1f} a second in a window of {width} x {height} ({drivers}), real-time factor "
-            f"{figures['real_time_factor']:.3f}, over {figures['seconds']:.0f} s",
-            f"latency   {latency['median']:.0f} ms from an input to its picture, 95 % within {latency['p95']:.0f} ms",
+            f"pictures  {figures['frames_per_s']:.1f} a second in a window of {width} x {height} "
+            f"({drivers}), real-time factor {figures['real_time_factor']:.3f}, "
+            f"over {figures['seconds']:.0f} s",
+            f"latency   {latency['median']:.0f} ms from an input to its picture, "
+            f"95 % within {latency['p95']:.0f} ms",
             f"frame     medians in ms: {stages}",
-            f"steps     {step['median']:.1f} ms each; of the simulated time {lengths}; begun late by {late['median']:.2f} ms, "
-            f"95 % within {late['p95']:.2f} ms, at most {late['max']:.1f} ms",
-            f"load      {figures['processor_s_per_s']:.2f} processor seconds a second; memory {figures['memory_mb'][0]:.0f} MB, "
-            f"at the end {figures['memory_mb'][-1]:.0f} MB",
+            f"steps     {step['median']:.1f} ms each; of the simulated time {lengths}; "
+            f"begun late by {late['median']:.2f} ms, 95 % within {late['p95']:.2f} ms, "
+            f"at most {late['max']:.1f} ms",
+            f"load      {figures['processor_s_per_s']:.2f} processor seconds a second; "
+            f"memory {figures['memory_mb'][0]:.0f} MB, at the end {figures['memory_mb'][-1]:.0f} MB",
             f"start     {figures['start_s']:.1f} s to the first picture: {start}",
         ]
     )

@@ -115,7 +115,10 @@ class Pypbd:
 
 
 def compare(rehearsal: Rehearsal) -> tuple[dict[str, Any], list[str]]:
-    """Medians [ms] of the pressed body's step with contacts and of its references, run in turn; the references that are missing."""
+    """Medians [ms] of the pressed body's step with contacts and of its references, run in turn.
+
+    Also the references that are missing, and why.
+    """
     solver, settings, model = rehearsal.organ.solver, rehearsal.organ.settings, rehearsal.organ.model
     assert isinstance(model, ShapeMatching) and isinstance(model.body, ParticleBody)
     iterations = settings.substeps * settings.iterations

@@ -128,7 +128,7 @@ def _setups(quick: bool) -> list[Setup]:
 
 
 def press(rehearsal: Rehearsal, warm_up_steps: int, share: float) -> Iterator[np.ndarray]:
-    """Poses of each step, from the stress-free shape: the paper's warm-up, then the scripted press or a share of it."""
+    """Poses of each step, from the stress-free shape: the paper's warm-up, a share of the scripted press."""
     rehearsal.organ.solver.restart()
     substeps, script = rehearsal.organ.settings.substeps, script_length_s(rehearsal.case)
     away = advanced(rehearsal.manipulator.home, -AWAY_MM)
@@ -140,7 +140,7 @@ def press(rehearsal: Rehearsal, warm_up_steps: int, share: float) -> Iterator[np
 
 
 def measure(rehearsal: Rehearsal, setup: Setup, share: float, arch: str) -> TimedPress:
-    """Press twice: once timed as a whole, once piece by piece; the first step, which compiles, is not timed."""
+    """Press twice: timed as a whole, and piece by piece; the first step, which compiles, is not timed."""
     solver, settings, home = rehearsal.organ.solver, rehearsal.organ.settings, rehearsal.manipulator.home
     warm_up_steps = max(1, round(share * rehearsal.case.press.warm_up_steps))
     phases = Phases(solver, settings)

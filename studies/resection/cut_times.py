@@ -1,4 +1,4 @@
-"""Times of a cut: from the request to the cut applied, of its parts, of the judgement, and of a step before and after it."""
+"""Times of a cut: from the request until it is shown, of its parts, its judgement, and of steps."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -43,7 +43,7 @@ class CutTimes:
 
 
 def cut_times(rehearsal: Rehearsal) -> CutTimes:
-    """Cut and undo several times, then step. The rehearsal has a tumour and a scanner. Raises ResectionError."""
+    """Cut and undo several times, then step. Needs a tumour and a scanner. Raises ResectionError."""
     times, anatomy = CutTimes(), rehearsal.anatomy
     assert anatomy.scanner is not None
     # What images need is there before the first cut.

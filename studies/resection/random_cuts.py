@@ -1,4 +1,4 @@
-"""Random scores and cuts on the device: each is refused in words, or gives two closed bodies and tissue that stays valid."""
+"""Random scores and cuts: each is refused in words, or gives two closed bodies and valid tissue."""
 
 import re
 from collections import Counter
@@ -53,7 +53,10 @@ def random_results(patient: str, rehearsal: Rehearsal, seeds: Sequence[int]) -> 
 
 
 def scored_patient(rehearsal: Rehearsal) -> ScoredPatient:
-    """The patient whom scores are set on. Its hilum is the middle of the vessels, or the innermost place of the surface."""
+    """The patient whom scores are set on.
+
+    Its hilum is the middle of the vessels, or the innermost place of the surface.
+    """
     case = rehearsal.case
     organ, vessel = case.organ, case.parts.get("vessel")
     if vessel is not None:
@@ -109,7 +112,7 @@ def surface_faults(cut: Cut, organ: trimesh.Trimesh) -> list[str]:
 
 
 def volume_change(anatomy: DeformedAnatomy, cut: Cut) -> float:
-    """Relative change of a volume since the cut: that of the whole organ then, and now of remnant and specimen as cut."""
+    """Relative change of volume since the cut: whole organ then, remnant now and specimen as cut."""
     remnant = volume_mm3(anatomy.vertices, cut.remnant.faces)
     specimen, organ = (
         volume_mm3(anatomy.carried_then(np.asarray(each.vertices)), each.faces)
@@ -123,7 +126,8 @@ def summary(results: Sequence[RandomResult]) -> str:
     made = [each for each in results if not each.refused]
     failed = [each for each in results if each.faults]
     lines = [
-        f"{len(results)} random scores: {len(made)} cut, {len(results) - len(made)} refused, {len(failed)} failed"
+        f"{len(results)} random scores: {len(made)} cut, {len(results) - len(made)} refused, "
+        f"{len(failed)} failed"
     ]
     reasons = Counter(each.reason for each in results if each.refused)
     lines += [f"  {number:3d} refused: {reason}" for reason, number in reasons.most_common()]

@@ -73,7 +73,8 @@ Part = tuple[str, dict[str, Any]]
 def resection(patients: tuple[Path, ...], out: Path, chosen: tuple[str, ...], cuts: int, seed: int) -> None:
     """Measure margins, balance, random cuts and times of the resection.
 
-    Of the embedded patient, and of further patients' folders. The finite elements of the balance take ten minutes the first time.
+    Of the embedded patient, and of further patients' folders. The finite elements of the balance take
+    ten minutes the first time.
     """
     make_folder(out)
     loaded: list[Patient] = [("embedded", *load_patient(EMBEDDED))]
@@ -147,7 +148,8 @@ def _random(patients: Sequence[Patient], seeds: range) -> Part:
         made = random_results(name, rehearsal, seeds)
         results += tqdm(made, desc=f"random scores, {name}", total=len(seeds), unit="score")
     change = [abs(each.volume_change_percent) for each in results if each.volume_change_percent is not None]
-    text = f"{summary(results)}\n  volume of remnant and specimen changed by {max(change, default=np.nan):.2f} % at most"
+    most = max(change, default=np.nan)
+    text = f"{summary(results)}\n  volume of remnant and specimen changed by {most:.2f} % at most"
     return text, dict(results=[asdict(each) for each in results])
 
 

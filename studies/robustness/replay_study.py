@@ -1,4 +1,4 @@
-"""The command ``study replay``: is a long session of random input, computed again from its file, identical to the bit?"""
+"""The command ``study replay``: is a random session, computed again from its file, identical to the bit?"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -106,7 +106,7 @@ def recorded(
 
 
 def restless_controls(rehearsal: Rehearsal, steps: int) -> Iterator[Controls]:
-    """The controls of a restless user at each step, who also undoes, redoes and resets; the same each time."""
+    """The controls at each step of a restless user, who also undoes, redoes and resets; always the same."""
     random, settings = np.random.default_rng(SEED), initial_settings(rehearsal.case)
     manipulator = rehearsal.manipulator
     above = np.flatnonzero(manipulator.normals @ rehearsal.case.gravity_direction < -0.5)
@@ -154,13 +154,16 @@ def replayed(rehearsal: Rehearsal, log: Log, from_s: float, bar: tqdm) -> dict[s
 def summary(figures: dict[str, Any]) -> str:
     """The session and its replays, a line each."""
     lines = [
-        f"recorded  {figures['minutes']:g} minutes, {figures['moments']} steps, {figures['ways_back']} of them undone, redone, reset or "
-        f"returned to a bookmark; {figures['megabytes']:.1f} MB in {figures['file']}; final state {figures['digest']}"
+        f"recorded  {figures['minutes']:g} minutes, {figures['moments']} steps, {figures['ways_back']} of "
+        f"them undone, redone, reset or returned to a bookmark; {figures['megabytes']:.1f} MB "
+        f"in {figures['file']}; "
+        f"final state {figures['digest']}"
     ]
     for run in figures["replays"]:
         same = run["digest"] == figures["digest"] and run["differs_s"] is None
         verdict = "identical" if same else f"DIFFERS from {run['differs_s']} s on"
         lines.append(
-            f"replayed  from {run['begins_s']:.0f} s: final state {run['digest']}, {verdict} in {run['compared']} states compared"
+            f"replayed  from {run['begins_s']:.0f} s: final state {run['digest']}, {verdict} "
+            f"in {run['compared']} states compared"
         )
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""The command ``study soak``: hours of rehearsal, faster than real time; checked for drift, growth and differences."""
+"""The command ``study soak``: hours of rehearsal, faster than real time: drift and differences."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -34,7 +34,8 @@ AWAY_MM = 100.0
 REPLAYED_MINUTES = 2
 SHOWN = {
     "shape_mm": "shape: mean distance from the first rest,\nafter a rigid fit (mm)",
-    "moved_mm": "position: mean distance from the first rest (mm);\nheld by its pedicle, in shape matching by friction alone",
+    "moved_mm": "position: mean distance from the first rest (mm);\n"
+    "held by its pedicle, in shape matching by friction alone",
     "memory_mb": "memory of the process since the first minute (MB)",
     "ms_median": "time of a step (ms)",
 }
@@ -84,7 +85,7 @@ def run_soak(
     arch: str,
     done: Callable[[], Any],
 ) -> dict[str, Any]:
-    """Figures of each simulated minute of ``minute_s`` [s], and whether replay and reset are identical to the bit."""
+    """Figures of each minute of ``minute_s`` [s], and whether replay and reset are identical to the bit."""
     rehearsal = build(scene, anatomy, setup, arch)
     organ = rehearsal.organ
     first, begun = organ.snapshot(), organ.digest()
@@ -165,8 +166,9 @@ def table(runs: list[dict[str, Any]]) -> str:
         worst = max(row["shape_mm"] for row in minutes)
         same = {name: "identical" if run[f"{name}_equal"] else "DIFFERS" for name in ("replay", "reset")}
         lines.append(
-            f"{run['model']}: shape at most {worst:.4f} mm from the first rest; memory {run['memory_growth_mb']:+.1f} MB; "
-            f"replay {same['replay']}; reset {same['reset']}; state restored {run['fallbacks']} times"
+            f"{run['model']}: shape at most {worst:.4f} mm from the first rest; "
+            f"memory {run['memory_growth_mb']:+.1f} MB; replay {same['replay']}; reset {same['reset']}; "
+            f"state restored {run['fallbacks']} times"
         )
     return "\n".join([table_of(COLUMNS.items(), rows), *lines])
 

@@ -34,8 +34,10 @@ SETTLE_STEPS, MOST_SETTLES, STILL_MM_S = 180, 20, 0.05
 
 
 class Specimen:
-    """A body at rest in its scene. ``home`` is the transducer's pose (4, 4) of first contact, ``parts`` the indices of
-    the points of each separate piece, ``mass`` (n,) [g], ``rest`` (n, 3) [mm] the points at rest.
+    """A body at rest in its scene.
+
+    ``home`` is the transducer's pose (4, 4) of first contact, ``parts`` the indices of the points of each
+    separate piece, ``mass`` (n,) [g], ``rest`` (n, 3) [mm] the points at rest.
     """
 
     def __init__(

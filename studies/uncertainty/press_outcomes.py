@@ -1,4 +1,4 @@
-"""The scripted press with given values of what is not known, in a worker: what the surgeon would see and feel."""
+"""The scripted press with given values of what is not known, in a worker: what the surgeon sees and feels."""
 
 from dataclasses import dataclass
 
@@ -26,12 +26,15 @@ class PressProblem:
 
 
 def press_outcome(problem: PressProblem, values: dict[str, float]) -> np.ndarray:
-    """The quantities and the tumour's centroid (depths, 9) [mm, N] of a press with these values, NaN for what there is not."""
+    """The quantities and the tumour's centroid (depths, 9) [mm, N] of a press with these values.
+
+    NaN for what there is not.
+    """
     return _press(built_once(problem.digest, lambda: rehearsal_of(problem.scene, problem.anatomy)), values)
 
 
 def _press(rehearsal: Rehearsal, values: dict[str, float]) -> np.ndarray:
-    """Settle from the stress-free shape, then press stage by stage, to the same poses of the probe for all values."""
+    """Settle from the stress-free shape, then press by stages, to the same poses for all values."""
     set_values(rehearsal, values)
     case, organ, anatomy = rehearsal.case, rehearsal.organ, rehearsal.anatomy
     press, touches = case.press, all_scanlines(case.probe)

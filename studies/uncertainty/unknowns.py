@@ -1,4 +1,4 @@
-"""What is not known of a patient's tissue: the parameters that the study of uncertainty varies, and their ranges."""
+"""What is not known of a patient's tissue: the parameters that the study varies, and their ranges."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,7 +24,10 @@ PARENCHYMA = "kidney"
 
 @dataclass(frozen=True)
 class Unknown:
-    """A parameter: name, unit, range, and whether equal ratios are equally likely (log-uniform), or equal differences (uniform)."""
+    """A parameter: name, unit, range.
+
+    ``is_ratio``: equal ratios are equally likely (log-uniform), and not equal differences (uniform).
+    """
 
     name: str
     unit: str
@@ -41,7 +44,7 @@ class Unknown:
 
 
 def with_all_parts(scene: Scene, anatomy: LoadedAnatomy) -> Scene:
-    """The scene, in which each part that has a surface has its own material: the scene's, or what is typical of it."""
+    """The scene; each part with a surface has its own material: the scene's, or what is typical of it."""
     assert isinstance(scene.tissue, NeoHookeanTissue)
     present = {*anatomy.parts, *(() if anatomy.tumour is None else ("tumour",))}
     typical = {name: PartMaterial() for name in get_args(PartName) if name in present}

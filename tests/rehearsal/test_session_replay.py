@@ -23,7 +23,7 @@ from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.packed_arrays import pack_seen
 from rehearsal.sessions.replay import Replay, open_session
-from rehearsal.sessions.session_file import Header, Log, SessionError, read_log
+from rehearsal.sessions.session_file import Header, Log, SessionError, makes_state, read_log
 from rehearsal.settings import initial_settings
 from rehearsal.tracking.pose_file import TimedPoses
 from rehearsal.window_loop import PREPARING
@@ -99,7 +99,9 @@ def files_of(rehearsal: Rehearsal, **named: Any) -> AskedFiles:
     return AskedFiles(Path(), rehearsal.case.scene, rehearsal.case.probe, Keys(), **named)
 
 
-def run_of(rehearsal: Rehearsal, loaded: LoadedAnatomy, asked: RehearseOptions, files: AskedFiles, viewer=None):
+def run_of(
+    rehearsal: Rehearsal, loaded: LoadedAnatomy, asked: RehearseOptions, files: AskedFiles, viewer=None
+):
     """A run whose steps are made in this process."""
     model = rehearsal.organ.model
     shown = rehearsal.anatomy, rehearsal.stepper, rehearsal.manipulator
@@ -158,9 +160,8 @@ def test_a_rehearsal_is_replayed_to_the_bit_and_the_pixel(built, monkeypatch, tm
     assert len({each["iterations"] for each in values if "iterations" in each}) > 1
     assert log.steps == 140 - 7 - 2
     for at_s in (0.0, 1.8):
-        rest = sum(isinstance(command, Move) for _, command in log.commands[log.place_at(at_s) :])
+        rest = sum(makes_state(command) for _, command in log.commands[log.place_at(at_s) :])
         shown, again, _ = rehearsed(built, monkeypatch, tmp_path, watching(rest), log, at_s)
-        # An image is shown for each step, but none of its own for what takes no time.
         assert len(shown) == rest and is_part_of(shown, seen) and again == end
         verdict = f"compared, to {log.length_s:.1f} s; state {end}"
         told = capsys.readouterr().out
