@@ -9,8 +9,8 @@ import trimesh
 from conftest import rotation_about
 from matplotlib.figure import Figure
 
-from rehearsal.image_and_surface_files import save_images
-from rehearsal.result_files import rounded, save_figure, spread, write_csv, write_json
+from rehearsal.image_and_surface_files import IMAGE, SCREENSHOT, save_images
+from rehearsal.result_files import next_number, rounded, save_figure, spread, write_csv, write_json
 from scenes.surfaces import translated, volume_mm3
 from studies.harness import distances_after_fit
 from ultrasound.probe import load_probe
@@ -81,3 +81,14 @@ def test_a_shape_is_compared_whatever_its_place_and_turn():
         np.linalg.norm(wanted - wanted.mean(axis=0), axis=1)
     )
     assert distances_after_fit(moved[:1], wanted[:1]) == pytest.approx([0.0])
+
+
+def test_the_next_number_is_one_more_than_the_highest(tmp_path):
+    assert next_number(tmp_path / "none", SCREENSHOT) == next_number(tmp_path, SCREENSHOT) == 1
+    others = "screenshot-0x9.png", "my-screenshot-044.png", "screenshot-050.png.part"
+    for name in ("screenshot-007.png", "screenshot-12.png", "013-ct.png", *others):
+        (tmp_path / name).touch()
+    assert next_number(tmp_path, SCREENSHOT) == 8 and next_number(tmp_path, IMAGE) == 14
+    for name in ("screenshot-999.png", "screenshot-1000.png", "1000-no ct.png"):
+        (tmp_path / name).touch()
+    assert next_number(tmp_path, SCREENSHOT) == next_number(tmp_path, IMAGE) == 1001

@@ -19,7 +19,6 @@ from rehearsal.resection.resection_view import ResectionView
 from rehearsal.resection.score_line import (
     SPACING_MM,
     ResectionError,
-    around_middle,
     crosses_itself,
     evenly_spaced,
     places_on,
@@ -86,14 +85,6 @@ def test_a_mark_is_a_vertex_of_the_divided_surface(share):
     longest = ORGAN.edges_unique_length.max()
     # At an edge or a corner it is moved into the face, by the least share of three corners.
     assert np.linalg.norm(vertices[own[0]] - place) <= 3 * 0.02 * longest
-
-
-def test_marks_are_ordered_by_their_angle():
-    points = circle(9)
-    normals = points / R
-    order = around_middle(np.roll(points, 4, axis=0), np.roll(normals, 4, axis=0))
-    steps = np.diff((order - 4) % 9)
-    assert set(steps % 9) in ({1}, {8})
 
 
 def test_places_are_the_nearest_of_the_surface():
