@@ -19,7 +19,7 @@ from ultrasound.array_contact import measure_contact
 from ultrasound.coverage import GRID_POINTS, VOXEL_MM, Coverage
 from ultrasound.plane_in_tissue import PlaneInTissue
 from ultrasound.probe import Probe
-from ultrasound.probe_manipulator import ProbeManipulator, advanced, poses_between
+from ultrasound.probe_manipulator import advanced, poses_between
 from ultrasound.target import Target
 
 # The most places of the target that are looked at in a search.
