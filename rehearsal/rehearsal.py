@@ -3,18 +3,29 @@
 The window has the same parts in two processes (``real_time/``).
 """
 
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
 import numpy as np
 
-from rehearsal.case import Case
+from errors import UserError
+from rehearsal.case import Case, case_of
+from rehearsal.configuration import with_quality
 from rehearsal.deformed_anatomy import DeformedAnatomy, scanned_ct
-from rehearsal.loop.command import Command, Load, NewSession
+from rehearsal.loop.command import Command, Load, Move, NewSession
 from rehearsal.loop.frame import Frame
 from rehearsal.loop.stepper import LocalStepper, Stepper
 from rehearsal.loop.timeline import Timeline
 from rehearsal.pressed_organ import PressedOrgan
-from scenes.anatomy import LoadedAnatomy
+from scenes.anatomy import LoadedAnatomy, load_anatomy
+from scenes.scene import EMBEDDED, load_scene, scene_file, with_options
 from scenes.terminal import ReportProgress, no_progress
+from sim.device import start
+from ultrasound.probe import DetailLevel, Mode
 from ultrasound.probe_manipulator import ProbeManipulator, advanced
+from ultrasound.scanner import Scanner
 
 
 class Rehearsal:
@@ -56,6 +67,31 @@ class Rehearsal:
         frame = self.stepper.newest()
         self.anatomy.show(frame)
         return frame
+
+    def move(self, pose: np.ndarray) -> Frame:
+        """Make a step to a pose (4, 4) of the transducer, and show the frame after it."""
+        return self.do(Move(pose=pose))
+
+    def images(
+        self,
+        mode: Mode = "both",
+        detail_level: DetailLevel = "speckle",
+        shape: tuple[int, int] | None = None,
+    ) -> dict[str, np.ndarray]:
+        """What the probe sees now: images uint8 of a shape (rows, columns), the scene's by default, by name. Raises UserError without a CT."""
+        image = self.case.scene.image
+        shown = self.anatomy.image_plane(), self.case.probe, mode, detail_level
+        return self._scanner.images(*shown, image.window_hu, image.level_hu, shape).by_name
+
+    def labels(self) -> np.ndarray:
+        """Ground truth of the last images (rows, columns) uint8: see ``ultrasound.ground_truth_labels``. Raises UserError without a CT."""
+        return self._scanner.ground_truth.render()
+
+    @property
+    def _scanner(self) -> Scanner:
+        if self.anatomy.scanner is None:
+            raise UserError("this scene has no CT, and so no images; add one to it")
+        return self.anatomy.scanner
 
     def advance(self, pose: np.ndarray) -> None:
         """Make a step to a pose (4, 4) for a study, without a frame of it: faster; ``show`` makes one."""
@@ -102,3 +138,20 @@ def scripted_pose(case: Case, manipulator: ProbeManipulator, time_s: float) -> n
 def script_length_s(case: Case) -> float:
     """Duration [s] of a case's scripted press."""
     return len(case.press.indentations_mm) * case.press.stage_steps * case.scene.solver.time_step_s
+
+
+def open_rehearsal(
+    scene: Path | str = EMBEDDED,
+    quality: str | None = None,
+    changes: Mapping[str, Any] = MappingProxyType({}),
+    arch: str = "cpu",
+) -> Rehearsal:
+    """A rehearsal of a scene file or a patient's folder, for a Python program: with a preset, and values of the scene changed by key.
+
+    Taichi starts anew, which frees what a rehearsal before had: one is open at a time in a process. Raises UserError, NoDevice.
+    """
+    path = scene_file(Path(scene))
+    loaded = with_quality(with_options(load_scene(path), changes), quality)
+    anatomy = load_anatomy(loaded, path.parent)
+    start(arch)
+    return Rehearsal(case_of(loaded, anatomy), anatomy)

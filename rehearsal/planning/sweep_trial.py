@@ -88,10 +88,14 @@ class Trial:
 
     def run(self, passes: list[np.ndarray], speed_mm_s: float) -> ScoreTerms:
         """Follow a path at a speed on its passes; deterministic."""
-        self._begin(speed_mm_s)
+        self.begin(speed_mm_s)
         for poses, way in zip(passes, [None, *self.transfers(passes)], strict=False):
             self._approach(poses[0], way)
             self._follow(poses)
+        return self.so_far(passes)
+
+    def so_far(self, passes: list[np.ndarray]) -> ScoreTerms:
+        """The terms of the measurements since the begin, at the poses of these passes."""
         return self.terms(
             passes,
             self._compressions,
@@ -127,9 +131,9 @@ class Trial:
 
     def try_pass(self, parameters: np.ndarray, poses: np.ndarray) -> TriedPass:
         """Follow one pass (n, 4, 4) from close above its first pose; deterministic."""
-        self._begin(TRIAL_MM_S)
+        self.begin(TRIAL_MM_S)
         self.rehearsal.organ.pose = advanced(poses[0], -ABOVE_MM)
-        self._move(self.rehearsal.organ.pose, poses[0])
+        self.move(self.rehearsal.organ.pose, poses[0])
         self._follow(poses)
         seen = self.coverage.seen[self.coverage.targets[self.target]][self._sampled]
         return self.tried(
@@ -161,7 +165,8 @@ class Trial:
         clear = clear_of_organ(self.manipulator, np.array(lifted))
         return np.concatenate([self.reach(np.concatenate(passes)), clear])
 
-    def _begin(self, speed_mm_s: float) -> None:
+    def begin(self, speed_mm_s: float) -> None:
+        """Begin anew: the organ settled, nothing measured."""
         self.rehearsal.reset()
         self.coverage.clear()
         self._compressions: list[float] = []
@@ -172,10 +177,10 @@ class Trial:
 
     def _follow(self, poses: np.ndarray) -> None:
         """From the first pose, where the probe is, to the last, with measurements at each."""
-        self._measure()
+        self.measure()
         for start, end in pairwise(poses):
-            self._move(start, end)
-            self._measure()
+            self.move(start, end)
+            self.measure()
 
     def _approach(self, pose: np.ndarray, way: np.ndarray | None) -> None:
         """Lower the probe to a pose, after its way from another pass, if there was one."""
@@ -183,10 +188,11 @@ class Trial:
             self.rehearsal.organ.pose = advanced(pose, -LIFT_MM)
         else:
             for goal in way:
-                self._move(self.rehearsal.organ.pose, goal, LIFTED_MM_S)
-        self._move(self.rehearsal.organ.pose, pose)
+                self.move(self.rehearsal.organ.pose, goal, LIFTED_MM_S)
+        self.move(self.rehearsal.organ.pose, pose)
 
-    def _move(self, start: np.ndarray, end: np.ndarray, speed_mm_s: float | None = None) -> None:
+    def move(self, start: np.ndarray, end: np.ndarray, speed_mm_s: float | None = None) -> None:
+        """Move the probe at a speed, the trial's by default."""
         for pose in poses_between(start, end, self._steps(start, end, speed_mm_s or self._speed_mm_s))[1:]:
             self._step(pose)
 
@@ -207,7 +213,8 @@ class Trial:
         steps = path_mm / (speed_mm_s * self.rehearsal.organ.settings.time_step_s)
         return max(1, int(np.ceil(steps - ROUNDED_STEPS)))
 
-    def _measure(self) -> None:
+    def measure(self) -> None:
+        """Measure compression, contact and coverage at the present pose."""
         self.rehearsal.show()
         anatomy, organ, probe = self.rehearsal.anatomy, self.case.organ, self.case.probe
         anatomy.embedding.update()
