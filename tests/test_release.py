@@ -14,6 +14,7 @@ from packaging.utils import canonicalize_name
 from test_session import header
 
 from rehearsal.run import replay_warning
+from rehearsal.sessions.session_file import SESSION_FORMAT
 from scenes.scene import AnatomyFiles, Scene, scene_text
 from version import FORMAT, PROJECT, VERSION
 
@@ -71,7 +72,8 @@ def test_the_version_is_the_same_everywhere(tmp_path):
 def test_files_have_the_format_of_the_major_version():
     written = scene_text(Scene(anatomy=AnatomyFiles(phantom=True))), header().model_dump_json()
     assert f"{FORMAT}." == VERSION[:2] and f"nephron_scene = {FORMAT}\n" in written[0]
-    assert f'"nephron_session":{FORMAT},' in written[1]
+    # Sessions are those of the next one.
+    assert SESSION_FORMAT == FORMAT + 1 and f'"nephron_session":{SESSION_FORMAT},' in written[1]
 
 
 def test_citation_and_changelog_have_this_version():
