@@ -16,9 +16,11 @@ IMPORT_S = 0.02
 
 
 def _stop(signum: int, frame: FrameType | None) -> None:
-    """Ctrl-C and SIGTERM: KeyboardInterrupt in a command, so that nothing incomplete remains; before and after it, the end.
+    """Ctrl-C and SIGTERM: KeyboardInterrupt in a command, so that nothing incomplete remains; before and
+    after it, the end.
 
-    Within a command's imports it is raised a moment later: modules that try what is installed catch it there, and go on without it.
+    Within a command's imports it is raised a moment later: modules that try what is installed catch it there,
+    and go on without it.
     """
     stack = set()
     while frame is not None:
@@ -43,7 +45,8 @@ try:
 
 except ModuleNotFoundError as missing:
     sys.exit(
-        f"nephron: {missing.name} is not installed for this Python; run make run once, then use the Python of its environment: "
+        f"nephron: {missing.name} is not installed for this Python; run make run once, then use the "
+        "Python of its environment: "
         ". .venv/bin/activate (Windows: .venv\\Scripts\\activate)"
     )
 
@@ -51,8 +54,8 @@ from errors import UserError
 from rehearsal.commands.lazy_group import LazyGroup
 from version import VERSION
 
-# While modules are loaded and kernels built, much is allocated and almost nothing becomes garbage. Python would look for garbage so often
-# that this took a tenth of the start.
+# While modules are loaded and kernels built, much is allocated and almost nothing becomes garbage. Python
+# would look for garbage so often that this took a tenth of the start.
 gc.set_threshold(100_000)
 
 # Where each command is, and what it does in a line.
@@ -130,14 +133,19 @@ def _open_streams() -> None:
 
 
 def _show_any_letter() -> None:
-    """Let output show what its encoding lacks, or a path that is not UTF-8, as backslashes instead of an error."""
+    """Let output show what its encoding lacks, or a path that is not UTF-8, as backslashes instead of an
+    error.
+    """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
 
 
 def read_probe(name: str) -> Any:
-    """The probe of a name or file, for ``import``, whose folder knows nothing of ultrasound. Raises UserError."""
+    """The probe of a name or file, for ``import``, whose folder knows nothing of ultrasound.
+
+    Raises UserError.
+    """
     from ultrasound.probe import load_probe
 
     return load_probe(name)
@@ -166,7 +174,10 @@ def main(arguments: list[str]) -> int:
     except OSError as error:
         message = _file_error(error)
     except MemoryError:
-        message = "the memory is full: close other programs, or take a smaller volume, larger cells or particles, or fewer --jobs"
+        message = (
+            "the memory is full: close other programs, or take a smaller volume, larger cells or "
+            "particles, or fewer --jobs"
+        )
     except (click.Abort, KeyboardInterrupt):
         click.echo("Stopped.", err=True)
         return 130

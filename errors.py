@@ -20,7 +20,9 @@ MOST_INT = 10**40
 
 
 class _Found(reprlib.Repr):
-    """How what was found is written: as Python has it, but never a whole matrix or file, and dates as TOML has them."""
+    """How what was found is written: as Python has it, but never a whole matrix or file, and dates as TOML
+    has them.
+    """
 
     def repr_date(self, value: date | time, level: int) -> str:
         return str(value)
@@ -57,11 +59,17 @@ CAUSES: tuple[tuple[type[Exception], str], ...] = (
 
 
 class UserError(ValueError):
-    """What the user can mend. The message is one line: where, what was found, what was expected, what to do."""
+    """What the user can mend.
+
+    The message is one line: where, what was found, what was expected, what to do.
+    """
 
 
 class PatientError(UserError):
-    """What is wrong with a patient's files. Letters that do not print, which could control a terminal, become question marks."""
+    """What is wrong with a patient's files.
+
+    Letters that do not print, which could control a terminal, become question marks.
+    """
 
     def __init__(self, line: str) -> None:
         super().__init__("".join(letter if letter.isprintable() else "?" for letter in line))
@@ -69,7 +77,8 @@ class PatientError(UserError):
 
 @contextmanager
 def parsing(what: str, advice: str) -> Iterator[None]:
-    """A library's parser raises many kinds of error: each becomes a PatientError with its cause in words, where that is known.
+    """A library's parser raises many kinds of error: each becomes a PatientError with its cause in words,
+    where that is known.
 
     Its own words and its warnings, which may name the patient, are dropped.
     """
@@ -81,7 +90,8 @@ def parsing(what: str, advice: str) -> Iterator[None]:
         raise
     except MemoryError as error:
         raise PatientError(
-            f"{what.rpartition(': ')[0] or what}: the memory is full while it is read; close other programs and try again; where there is "
+            f"{what.rpartition(': ')[0] or what}: the memory is full while it is read; close other programs "
+            "and try again; where there is "
             "enough memory, the file is damaged"
         ) from error
     except Exception as error:
@@ -103,10 +113,12 @@ def explained(
     unknown: Callable[[list[str]], str] = lambda where: "unknown key",
     tags: Collection[str] = (),
 ) -> str:
-    """The first problem in a line: the key, what was found, what was expected, and the other keys that are wrong.
+    """The first problem in a line: the key, what was found, what was expected, and the other keys that are
+    wrong.
 
-    ``unknown`` suggests what the writer of an unknown key, given by its place, may have meant. ``tags`` are the kinds of a union, which
-    pydantic names among the keys. A validator's own message that begins with its key is left as it is.
+    ``unknown`` suggests what the writer of an unknown key, given by its place, may have meant. ``tags`` are
+    the kinds of a union, which pydantic names among the keys. A validator's own message that begins with its
+    key is left as it is.
     """
     problems = error.errors(include_url=False)
     # A key that is missing under one spelling and unknown under another is one mistake: name the unknown one.

@@ -24,7 +24,9 @@ THOUSANDS = re.compile(r"\s*[-+]?[1-9]\d{0,2}(\.\d{3})+\s*")
 
 
 class TextError(UserError):
-    """A text that cannot be read as what it should be; the message is the cause in words, without the file."""
+    """A text that cannot be read as what it should be; the message is the cause in words, without the
+    file.
+    """
 
 
 def read_text(path: Path) -> str:
@@ -67,10 +69,11 @@ def json_value(text: str | bytes) -> Any:
 
 
 def table_rows(text: str) -> dict[int, list[str]]:
-    """Line number -> cells of a table, without empty lines, those that begin with #, and columns that are empty at the end.
+    """Line number -> cells of a table, without empty lines, those that begin with #, and columns that are
+    empty at the end.
 
-    They are separated by commas, or by semicolons or tabs, as Excel does in countries with a decimal comma, which becomes a point. Raises
-    TextError.
+    They are separated by commas, or by semicolons or tabs, as Excel does in countries with a decimal comma,
+    which becomes a point. Raises TextError.
     """
     lines = {
         number: line
@@ -95,13 +98,17 @@ def _without_empty_end(row: list[str]) -> list[str]:
 
 
 def _with_points(rows: dict[int, list[str]]) -> dict[int, list[str]]:
-    """The rows with decimal points instead of commas. Raises TextError for a number that may be a thousand times another."""
+    """The rows with decimal points instead of commas.
+
+    Raises TextError for a number that may be a thousand times another.
+    """
     if not any(DECIMAL_COMMA.fullmatch(cell) for row in rows.values() for cell in row):
         return rows
     for number, row in rows.items():
         for cell in filter(THOUSANDS.fullmatch, row):
             raise TextError(
-                f"line {number}: {cell.strip()} may be thousands or a decimal point, and other numbers have decimal commas: "
+                f"line {number}: {cell.strip()} may be thousands or a decimal point, and other numbers have "
+                "decimal commas: "
                 "write it without the point"
             )
     return {

@@ -14,12 +14,16 @@ FORMAT = int(VERSION.partition(".")[0])
 
 
 def of_this_format(values: Any, key: str) -> Any:
-    """The values of a file, as they are. Raises ValueError where ``key`` states the format of another version."""
+    """The values of a file, as they are.
+
+    Raises ValueError where ``key`` states the format of another version.
+    """
     found = values.get(key, FORMAT) if isinstance(values, dict) else FORMAT
     if isinstance(found, bool) or not isinstance(found, int) or not 0 < found < 1000:
         raise ValueError(f"{key} = {str(found)[:20]!r}: expected {FORMAT}")
     if found != FORMAT:
         raise ValueError(
-            f"{key} = {found}: written by Nephron {found}, and this is Nephron {VERSION}; use Nephron {found}, or make the file anew"
+            f"{key} = {found}: written by Nephron {found}, and this is Nephron {VERSION}; use Nephron "
+            f"{found}, or make the file anew"
         )
     return values

@@ -14,7 +14,9 @@ RESTORED_S = 4.0
 
 
 class Announcements:
-    """An ``Observer`` that posts notices; ``has_restored`` for RESTORED_S after the divergence check restored a state."""
+    """An ``Observer`` that posts notices; ``has_restored`` for RESTORED_S after the divergence check
+    restored a state.
+    """
 
     def __init__(self, anatomy: DeformedAnatomy, notices: Notices) -> None:
         self.anatomy, self.notices = anatomy, notices

@@ -30,7 +30,8 @@ from scenes.import_findings import acknowledged_warnings, open_warnings
 from scenes.scene import Scene, load_scene, scene_file, with_options
 from ultrasound.probe import Probe, ProbeError, probe_of_values
 
-# Between passes the probe moves around the organ, farther off the longer its housing is (up to 500 mm); no pose of a plan is farther than this.
+# Between passes the probe moves around the organ, farther off the longer its housing is (up to 500 mm); no
+# pose of a plan is farther than this.
 MOST_OFF_MM = 1000.0
 
 
@@ -65,8 +66,10 @@ def read_files(asked: RehearseOptions) -> AskedFiles:
         resection_plan = read_resection_plan(asked.plan)
         if asked.headless and not (asked.track or asked.replay):
             raise CommandError(
-                f"--plan: {asked.plan} is a plan of a resection, and the scripted press cuts nothing; open it in a window, or add poses "
-                "with a cut (--track, such as docs/resection.json on the embedded patient) or a session (--replay), which is then compared with it"
+                f"--plan: {asked.plan} is a plan of a resection, and the scripted press cuts nothing; open "
+                "it in a window, or add poses "
+                "with a cut (--track, such as docs/resection.json on the embedded patient) or a session "
+                "(--replay), which is then compared with it"
             )
     elif asked.plan is not None:
         plan = read_plan(asked.plan)
@@ -87,7 +90,8 @@ def check_anatomy(files: AskedFiles, asked: RehearseOptions, anatomy: LoadedAnat
         )
     if files.bands is not None and files.bands.anatomy != fingerprint(anatomy):
         raise UncertaintyError(
-            f"{files.scene.uncertainty}: is of other anatomy than this scene; make it anew with: app.py study uncertainty, or leave "
+            f"{files.scene.uncertainty}: is of other anatomy than this scene; make it anew with: app.py "
+            "study uncertainty, or leave "
             "uncertainty out"
         )
     plans = [] if files.plan is None else [files.plan]
@@ -99,7 +103,8 @@ def check_anatomy(files: AskedFiles, asked: RehearseOptions, anatomy: LoadedAnat
         check_reach(plan, anatomy.organ.vertices)
     if files.resection_plan is not None and files.resection_plan.anatomy != fingerprint(anatomy):
         raise ResectionPlanError(
-            "the plan of the resection is for other anatomy than this scene: name its scene or patient's folder before --plan; a patient "
+            "the plan of the resection is for other anatomy than this scene: name its scene or patient's "
+            "folder before --plan; a patient "
             "imported again counts as another"
         )
 
@@ -126,7 +131,8 @@ def session_of(path: Path, at_s: float) -> Log:
 
 
 def as_recorded(log: Log, scene: Scene) -> tuple[Scene, Probe]:
-    """The patient of a scene with all other settings of a session, and the session's probe; prints where these differ from the scene's.
+    """The patient of a scene with all other settings of a session, and the session's probe; prints where
+    these differ from the scene's.
 
     Raises SessionError.
     """
@@ -148,7 +154,8 @@ def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:
     """Raises PlanError if a plan is for other anatomy (by its fingerprint) or for another probe."""
     if plan.anatomy != anatomy:
         raise PlanError(
-            "the plan is for other anatomy than this scene: name its scene or patient's folder before --plan; "
+            "the plan is for other anatomy than this scene: name its scene or patient's folder before "
+            "--plan; "
             "a patient imported again counts as another"
         )
     planned = _probe_name(plan.probe.get("TransducerName"), plan.probe.get("HousingMm"))
@@ -160,7 +167,9 @@ def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:
 
 
 def check_reach(plan: Plan, organ: np.ndarray) -> None:
-    """Raises PlanError where a pose of a plan, of its passes or between them, is far from an organ's vertices (n, 3) [mm, LPS]."""
+    """Raises PlanError where a pose of a plan, of its passes or between them, is far from an organ's
+    vertices (n, 3) [mm, LPS].
+    """
     tree = cKDTree(organ)
     for number, sweep in enumerate(plan.sweeps, 1):
         for kind, lists in (("pass", sweep.passes), ("transfer", sweep.transfers)):
@@ -169,7 +178,8 @@ def check_reach(plan: Plan, organ: np.ndarray) -> None:
                 worst = int(off_mm.argmax())
                 if off_mm[worst] > MOST_OFF_MM:
                     raise PlanError(
-                        f"the plan's sweep {number}, {kind} {place}, pose {worst + 1} is {off_mm[worst]:.0f} mm from the organ: expected "
+                        f"the plan's sweep {number}, {kind} {place}, pose {worst + 1} is {off_mm[worst]:.0f} "
+                        "mm from the organ: expected "
                         f"at most {MOST_OFF_MM:g} mm; the file was changed, plan anew with: app.py plan"
                     )
 

@@ -34,7 +34,9 @@ def model_of(tissue: TissueSection) -> type[TissueModel]:
 
 
 def static_shape(mesh: trimesh.Trimesh, tissue: TissueSection) -> SignedDistanceField:
-    """The signed distance field of a fixed closed surface [mm], as far around as the tissue model needs it."""
+    """The signed distance field of a fixed closed surface [mm], as far around as the tissue model needs
+    it.
+    """
     return SignedDistanceField.of_surface(mesh.vertices, mesh.faces, model_of(tissue).reach_mm(tissue))
 
 
@@ -77,10 +79,11 @@ def build_solver(
     tethers: Sequence[Tether] = (),
     parts: Sequence[Part] = (),
 ) -> Solver:
-    """A solver of the organ [mm] among shapes, the tool among them; ``parts`` of it have their own material. Raises SamplingError.
+    """A solver of the organ [mm] among shapes, the tool among them; ``parts`` of it have their own material.
+    Raises SamplingError.
 
-    Shape matching also takes an organ that was filled before (``sim.shape_matching.fill_organ``). ``serial`` says whether a step is one
-    kernel on one core; left open, the body's size and the machine decide.
+    Shape matching also takes an organ that was filled before (``sim.shape_matching.fill_organ``). ``serial``
+    says whether a step is one kernel on one core; left open, the body's size and the machine decide.
     """
     contact, section = contact or Contact(), section or SolverSection()
     scaling = section.mass_scaling_per_mm

@@ -1,4 +1,6 @@
-"""The caliper: the distance of two points on the image, now and at rest; ``render/ultrasound_panel.py`` draws it."""
+"""The caliper: the distance of two points on the image, now and at rest; ``render/ultrasound_panel.py``
+draws it.
+"""
 
 from dataclasses import dataclass
 
@@ -31,7 +33,9 @@ class Caliper:
             self.points = ()
 
     def figure(self, frame: CineFrame) -> str:
-        """The distance of the points in the deformed tissue and at rest, as text; empty for fewer than two."""
+        """The distance of the points in the deformed tissue and at rest, as text; empty for fewer than
+        two.
+        """
         if len(self.points) < 2:
             return ""
         start, end = np.array(self.points)
@@ -43,7 +47,9 @@ class Caliper:
 
 
 def at_rest(rest: np.ndarray, points_mm: np.ndarray, view: View) -> np.ndarray:
-    """Rest positions (n, 3) [mm] of points (n, 2) on a view's plane; ``rest`` (rows, columns, 3) are those of its image."""
+    """Rest positions (n, 3) [mm] of points (n, 2) on a view's plane; ``rest`` (rows, columns, 3) are those
+    of its image.
+    """
     share = (points_mm + [view.width_mm / 2, view.above_mm]) / [view.width_mm, view.depth_mm]
     at = share[:, ::-1].T * (np.array(rest.shape[:2])[:, None] - 1)
     return np.column_stack(

@@ -1,4 +1,7 @@
-"""A case: a scene's anatomy at rest, its probe and its press. It does not change, and holds neither solver nor CT."""
+"""A case: a scene's anatomy at rest, its probe and its press.
+
+It does not change, and holds neither solver nor CT.
+"""
 
 from dataclasses import dataclass
 
@@ -26,8 +29,8 @@ TUMOUR = "tumour"
 class Case:
     """What is rehearsed. Positions are mm relative to ``origin`` (3,), the middle of the resting organ (LPS).
 
-    ``parts`` are surfaces in the organ by tissue, the tumour apart; ``shapes`` are the rigid ones around it, relative to the patient
-    (LPS); ``press`` has a value for all that the scene leaves open.
+    ``parts`` are surfaces in the organ by tissue, the tumour apart; ``shapes`` are the rigid ones around it,
+    relative to the patient (LPS); ``press`` has a value for all that the scene leaves open.
     """
 
     scene: Scene
@@ -57,19 +60,27 @@ class Case:
         return pose_at(target, np.array(self.press.direction), np.array(self.press.lateral), self.size_mm[2])
 
     def image_plane(self, pose: np.ndarray, probe: Probe | None = None) -> ImagePlane:
-        """The image plane of a transducer at a pose (4, 4), of the extent of the probe or of the probe with other settings."""
+        """The image plane of a transducer at a pose (4, 4), of the extent of the probe or of the probe
+        with other settings.
+        """
         return image_plane(pose, self.size_mm[2], *(probe or self.probe).extent_mm)
 
     def probe_in_patient(self, pose: np.ndarray) -> np.ndarray:
-        """The pose (4, 4) of the probe in the patient (LPS), in PLUS's axes, of a transducer at a pose (4, 4)."""
+        """The pose (4, 4) of the probe in the patient (LPS), in PLUS's axes, of a transducer at a pose (4,
+        4).
+        """
         return shifted(self.image_plane(pose).world_from_plane, self.origin)
 
     def transducer_at(self, probe: np.ndarray) -> np.ndarray:
-        """The transducer's pose (4, 4) where the probe, in PLUS's axes, is at a pose (4, 4) in the patient (LPS)."""
+        """The transducer's pose (4, 4) where the probe, in PLUS's axes, is at a pose (4, 4) in the patient
+        (LPS).
+        """
         return pose_of_image_plane(shifted(probe, -self.origin), self.size_mm[2])
 
     def manipulator(self, settled: np.ndarray) -> ProbeManipulator:
-        """The manipulator over the settled surface (n, 3) [mm] of the organ, with the transducer just touching it."""
+        """The manipulator over the settled surface (n, 3) [mm] of the organ, with the transducer just
+        touching it.
+        """
         faces, radius = np.array(self.organ.faces, np.int64), self.probe.radius_mm
         normals = np.array(trimesh.Trimesh(settled, faces, process=False).vertex_normals)
         lateral, speed = np.array(self.press.lateral), self.scene.transducer.speed_mm_s

@@ -12,7 +12,9 @@ KEPT_S, KEPT_A_SECOND = 10.0, 30
 
 @dataclass(frozen=True)
 class CineFrame:
-    """A view, its time [s], and the rest positions (rows, columns, 3) [mm] of its tissue; None without a CT."""
+    """A view, its time [s], and the rest positions (rows, columns, 3) [mm] of its tissue; None without a
+    CT.
+    """
 
     time_s: float
     view: View

@@ -1,4 +1,6 @@
-"""One path from file and options to the solver: sections of a scene -> ``Setup`` (presets, changes) -> ``StepSettings`` of sim/."""
+"""One path from file and options to the solver: sections of a scene -> ``Setup`` (presets, changes) ->
+``StepSettings`` of sim/.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -21,7 +23,8 @@ class SetupError(UserError):
 
 @dataclass(frozen=True)
 class Setup:
-    """A scene's sections of tissue (a ``TissueSection``) and solver, for any case; what the tissue leaves open of the material is the case's own.
+    """A scene's sections of tissue (a ``TissueSection``) and solver, for any case; what the tissue leaves
+    open of the material is the case's own.
 
     The lengths of warm-up and stage are the paper's.
     """
@@ -58,7 +61,10 @@ class Setup:
         return self.but(**{self.tissue.size_key: size_mm})
 
     def but(self, **values: Any) -> "Setup":
-        """The same with some values changed, by their names in any of the sections. Raises SetupError for an unknown one."""
+        """The same with some values changed, by their names in any of the sections.
+
+        Raises SetupError for an unknown one.
+        """
         own = {name: values.pop(name) for name in ("warm_up_steps", "stage_steps") if name in values}
         step = {name: values.pop(name) for name in SolverSection.model_fields if name in values}
         for name in values:

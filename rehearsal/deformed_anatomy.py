@@ -1,4 +1,7 @@
-"""The anatomy as a frame deforms it: surfaces, image plane, figures of a cut. It needs no solver: the frame carries its points."""
+"""The anatomy as a frame deforms it: surfaces, image plane, figures of a cut.
+
+It needs no solver: the frame carries its points.
+"""
 
 from concurrent.futures import Future
 from functools import partial
@@ -41,7 +44,8 @@ BESIDE_MM = 8.0
 class DeformedAnatomy:
     """The surfaces of a case, and what its scanner images, as the frame that was shown last deforms them.
 
-    Each version of the geometry has skins of its own. ``start`` is the CT, classified in the background since then.
+    Each version of the geometry has skins of its own. ``start`` is the CT, classified in the background since
+    then.
     """
 
     frame: Frame
@@ -94,7 +98,9 @@ class DeformedAnatomy:
             self.scanner.volumes.set_crater(crater)
 
     def skin(self, points: np.ndarray) -> Skin:
-        """Points (n, 3) [mm] of the tissue at rest that move with it; ``update`` takes them to the present frame."""
+        """Points (n, 3) [mm] of the tissue at rest that move with it; ``update`` takes them to the present
+        frame.
+        """
         return Skin(self._carrier, points)
 
     # At rest
@@ -171,7 +177,8 @@ class DeformedAnatomy:
         return None if self.scanner is None else self.scanner.plane.rest_grid(REST_PLACES)
 
     def tumour_outline(self, at_rest: bool = False) -> np.ndarray | None:
-        """The tumour's outline on the image plane, deformed or as in the CT: segments (n, 2, 2) on the plane [mm].
+        """The tumour's outline on the image plane, deformed or as in the CT: segments (n, 2, 2) on the plane
+        [mm].
 
         None without a tumour.
         """
@@ -187,14 +194,19 @@ class DeformedAnatomy:
     # A cut
 
     def carried_then(self, points: np.ndarray) -> np.ndarray:
-        """Where points (n, 3) [mm] of the whole organ at rest were when it was cut. Raises ResectionError without a cut."""
+        """Where points (n, 3) [mm] of the whole organ at rest were when it was cut.
+
+        Raises ResectionError without a cut.
+        """
         request = self.frame.resection.cut
         if request is None:
             raise ResectionError("nothing was cut yet")
         return self.geometry.whole.carried(np.asarray(points, float), request.nodes_mm)  # type: ignore[attr-defined]
 
     def specimen_beside(self) -> np.ndarray:
-        """Vertices (n, 3) [mm] of the specimen as it was cut, beside the end of the organ that is nearer to it. Raises ResectionError."""
+        """Vertices (n, 3) [mm] of the specimen as it was cut, beside the end of the organ that is nearer
+        to it. Raises ResectionError.
+        """
         if self.cut is None:
             raise ResectionError("nothing was cut yet")
         vertices = self.carried_then(self.cut.specimen.vertices)
@@ -206,7 +218,9 @@ class DeformedAnatomy:
 
     @property
     def judgement(self) -> Judgement | None:
-        """The figures of the cut; None without a cut, without a tumour to judge by, or where ``judgement_fault`` says why there are none."""
+        """The figures of the cut; None without a cut, without a tumour to judge by, or where
+        ``judgement_fault`` says why there are none.
+        """
         return self._judgement_of(self.frame.resection)[0]
 
     @property
@@ -232,7 +246,9 @@ class DeformedAnatomy:
 
 
 class ScannedCt:
-    """The CT of an anatomy as the scanner needs it; ``acoustics`` are computed in the background from now on, where they are needed soon."""
+    """The CT of an anatomy as the scanner needs it; ``acoustics`` are computed in the background from now
+    on, where they are needed soon.
+    """
 
     def __init__(self, case: Case, anatomy: LoadedAnatomy, ct: Grid, needs_b_mode: bool) -> None:
         self.anatomy = scanned_anatomy(case.organ, ct, anatomy, case.origin, case.scene.image.atlas)

@@ -1,7 +1,8 @@
-"""A Gymnasium environment: a probe on a patient's deformable kidney. What it sees and presses is scored as a planned sweep is.
+"""A Gymnasium environment: a probe on a patient's deformable kidney. What it sees and presses is scored as a
+planned sweep is.
 
-Needs the package gymnasium. Each environment has a process of its own, as Gymnasium's ``AsyncVectorEnv`` gives it: Taichi serves one
-rehearsal in a process.
+Needs the package gymnasium. Each environment has a process of its own, as Gymnasium's ``AsyncVectorEnv``
+gives it: Taichi serves one rehearsal in a process.
 """
 
 from pathlib import Path
@@ -22,7 +23,8 @@ from sim.device import start
 from ultrasound.probe_manipulator import ManipulatorState, advanced, array_face_centre
 from ultrasound.target import Target
 
-# The greatest motion of an action along and about each axis of the transducer, and the speed with which it is made.
+# The greatest motion of an action along and about each axis of the transducer, and the speed with which it is
+# made.
 MOST_MM, MOST_DEG, SPEED_MM_S = 3.0, 10.0, 20.0
 # An episode begins at a place that is this far from the middle, along both axes of the array face.
 BEGINS_WITHIN_MM = 12.0
@@ -31,12 +33,14 @@ Observation = dict[str, np.ndarray]
 
 
 class ProbeEnvironment(gymnasium.Env[Observation, np.ndarray]):
-    """An action (6,), -1 to 1, moves the transducer along its axes x, y, z and turns it about them, around the middle of the array face.
+    """An action (6,), -1 to 1, moves the transducer along its axes x, y, z and turns it about them, around
+    the middle of the array face.
 
-    An observation has ``image`` (pixels, pixels) uint8, the B-mode image; ``pose`` (12,), rows of the probe's pose in the patient
-    (mm, LPS, in PLUS's axes); and ``force`` (3,) [N] of the tissue on the probe. The reward is the change of the planner's score
-    (``rehearsal.planning.sweep_score``), so that an episode's rewards sum to the score of its path. An episode has so many
-    ``actions``. The same seed and actions give the same bits. Raises UserError.
+    An observation has ``image`` (pixels, pixels) uint8, the B-mode image; ``pose`` (12,), rows of the probe's
+    pose in the patient (mm, LPS, in PLUS's axes); and ``force`` (3,) [N] of the tissue on the probe. The
+    reward is the change of the planner's score (``rehearsal.planning.sweep_score``), so that an episode's
+    rewards sum to the score of its path. An episode has so many ``actions``. The same seed and actions give
+    the same bits. Raises UserError.
     """
 
     def __init__(
@@ -87,7 +91,9 @@ class ProbeEnvironment(gymnasium.Env[Observation, np.ndarray]):
         return self._observation(), self._score - before, False, is_over, {"seen": terms.seen}
 
     def action_towards(self, goal: np.ndarray) -> np.ndarray:
-        """The action (6,) that moves the transducer to a pose (4, 4), or as far towards it as one can: to follow a plan."""
+        """The action (6,) that moves the transducer to a pose (4, 4), or as far towards it as one can: to
+        follow a plan.
+        """
         pose, length_mm = self._rehearsal.organ.pose, self._rehearsal.case.size_mm[2]
         away_mm = array_face_centre(goal, length_mm) - array_face_centre(pose, length_mm)
         turn = Rotation.from_matrix(pose[:3, :3].T @ goal[:3, :3]).as_rotvec(degrees=True)

@@ -79,7 +79,9 @@ class Pictures:
 
 @dataclass
 class HeadlessLoop:
-    """A rehearsal without a window: each time around one step, and where it ``draws``, an image of it, also for the link."""
+    """A rehearsal without a window: each time around one step, and where it ``draws``, an image of it,
+    also for the link.
+    """
 
     rehearsal: Rehearsal
     source: Source

@@ -26,7 +26,9 @@ SCREENSHOT, IMAGE = r"screenshot-([0-9]{3,9})\.png", r"([0-9]{3,9})-.*\.png"
 
 @dataclass(frozen=True)
 class SavedImage:
-    """An image file: its kind ("B-mode", "CT"), its shape (rows, columns), and the spacing of rows and columns."""
+    """An image file: its kind ("B-mode", "CT"), its shape (rows, columns), and the spacing of rows and
+    columns.
+    """
 
     kind: str
     path: Path
@@ -48,7 +50,9 @@ def save_images(
     prefix: Path,
     dicom: bool = True,
 ) -> list[SavedImage]:
-    """Write images (rows, columns), or (rows, columns, 3) of Doppler, by kind, with square pixels, to files that share a prefix. Raises OSError."""
+    """Write images (rows, columns), or (rows, columns, 3) of Doppler, by kind, with square pixels, to
+    files that share a prefix. Raises OSError.
+    """
     # A quarter of a second, which the start of a rehearsal does not need.
     from ultrasound.dicom_image import save_dicom
 
@@ -73,7 +77,9 @@ def save_screenshot(image: np.ndarray, out: Path) -> None:
 
 
 def save_view(view: View, probe: Probe, out: Path) -> str:
-    """Write the images of a view under the next free number, and print their paths; return the prefix of their names."""
+    """Write the images of a view under the next free number, and print their paths; return the prefix of
+    their names.
+    """
     prefix = out / f"{next_number(out, IMAGE):03d}"
     shown = view.images if view.doppler is None else view.images | {DOPPLER: view.doppler}
     for saved in save_images(shown, view.width_mm, view.depth_mm, probe, prefix):
@@ -82,7 +88,8 @@ def save_view(view: View, probe: Probe, out: Path) -> str:
 
 
 def save_surfaces(anatomy: DeformedAnatomy, out: Path, prefix: str = "") -> None:
-    """Write organ, tumour, and a specimen as it was cut (PLY, mm, LPS), and the score in the CT, and print the paths.
+    """Write organ, tumour, and a specimen as it was cut (PLY, mm, LPS), and the score in the CT, and print
+    the paths.
 
     Vertices are in the order of the rest surfaces.
     """

@@ -24,10 +24,11 @@ def image_view(
     shape: tuple[int, int] | None = None,
     persistence: Persistence | None = None,
 ) -> View:
-    """Compute the images of the probe at its present pose, with overlays; add the time that they took to ``ms``.
+    """Compute the images of the probe at its present pose, with overlays; add the time that they took to
+    ``ms``.
 
-    ``shape`` are the rows and columns of the images, at most the scene's pixels each, which is also the default. ``persistence`` is that
-    of the images shown before; without it an image stands alone.
+    ``shape`` are the rows and columns of the images, at most the scene's pixels each, which is also the
+    default. ``persistence`` is that of the images shown before; without it an image stands alone.
     """
     scanner, pixels = anatomy.scanner, anatomy.case.scene.image.pixels
     shown = settings.mode, settings.detail_level, settings.window_hu, settings.level_hu

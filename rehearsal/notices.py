@@ -6,7 +6,10 @@ from tqdm import tqdm
 
 
 class Notices:
-    """A queue of messages, in the order in which they were posted. ``{action}`` in a text stands for the key of that action."""
+    """A queue of messages, in the order in which they were posted.
+
+    ``{action}`` in a text stands for the key of that action.
+    """
 
     def __init__(self) -> None:
         self._queue: list[tuple[str, bool, bool]] = []
@@ -17,7 +20,9 @@ class Notices:
             self._queue.append((text, on_screen, in_terminal))
 
     def present(self, worded: Callable[[str], str] = str) -> list[str]:
-        """Print the messages for the terminal and return those for the screen, with the keys in words; empty the queue."""
+        """Print the messages for the terminal and return those for the screen, with the keys in words;
+        empty the queue.
+        """
         queue, self._queue = self._queue, []
         shown = []
         for text, on_screen, in_terminal in queue:

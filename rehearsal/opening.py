@@ -1,4 +1,6 @@
-"""Open a rehearsal: read what the user names, build the model, and for a window start the process of its solver."""
+"""Open a rehearsal: read what the user names, build the model, and for a window start the process of its
+solver.
+"""
 
 import gc
 import os
@@ -38,7 +40,10 @@ if TYPE_CHECKING:
 
 @contextmanager
 def opened(asked: RehearseOptions, process: StartedProcess | None) -> Iterator["RehearsalRun"]:
-    """The rehearsal that the user asks for, in a window with the process for its solver. Raises UserError, CommandError."""
+    """The rehearsal that the user asks for, in a window with the process for its solver.
+
+    Raises UserError, CommandError.
+    """
     start = StartTimes()
     start.begin("Files")
     files = read_files(asked)
@@ -87,9 +92,11 @@ def opened(asked: RehearseOptions, process: StartedProcess | None) -> Iterator["
             if solver is None and not asked.no_pictures:
                 progress("Building the model: the first picture")
                 compile_picture(built.anatomy)
-        # All this lives as long as the rehearsal: to look for garbage in it would delay single frames by a tenth of a second.
+        # All this lives as long as the rehearsal: to look for garbage in it would delay single frames by a
+        # tenth of a second.
         gc.freeze()
-        # At the end Python must be able to delete it: Taichi writes its kernels to their cache only when it is deleted.
+        # At the end Python must be able to delete it: Taichi writes its kernels to their cache only when it
+        # is deleted.
         resources.callback(gc.unfreeze)
         start.begin("First picture")
         if chosen:
@@ -155,7 +162,10 @@ def built_for_window(
     viewer: "Window",
     progress: ReportProgress,
 ) -> "Built":
-    """The rehearsal that a window shows. While the process of the solver brings the tissue to rest, this one prepares the first picture."""
+    """The rehearsal that a window shows.
+
+    While the process of the solver brings the tissue to rest, this one prepares the first picture.
+    """
     from rehearsal.deformed_anatomy import DeformedAnatomy, scanned_ct
     from rehearsal.drawn_geometry import drawn_geometry
     from rehearsal.loop.frame import at_rest
@@ -183,12 +193,15 @@ def built_for_window(
 
 
 def check_graphics() -> None:
-    """Raises CommandError if no window can be opened: screen or driver; before minutes are spent on building the model."""
+    """Raises CommandError if no window can be opened: screen or driver; before minutes are spent on
+    building the model.
+    """
     from sim.device import is_available
 
     if depth := wrong_depth():
         raise CommandError(
-            f"the display {os.environ.get('DISPLAY')} has {depth} bits of colour; expected 24, with others the graphics driver would "
+            f"the display {os.environ.get('DISPLAY')} has {depth} bits of colour; expected 24, with others "
+            "the graphics driver would "
             "end the program; set the screen to 24 bits, or run with --headless"
         )
     if not is_available("vulkan"):
@@ -208,7 +221,10 @@ def compile_picture(anatomy: "DeformedAnatomy") -> "View":
 def scene_within_budget(
     files: AskedFiles, anatomy: LoadedAnatomy, arch: str, progress: ReportProgress, asked: RehearseOptions
 ) -> tuple[Scene, str]:
-    """The scene with the settings that meet the budgets on this machine, and a text that names them. Raises NoPoint."""
+    """The scene with the settings that meet the budgets on this machine, and a text that names them.
+
+    Raises NoPoint.
+    """
     from rehearsal.rehearsal import Rehearsal
     from rehearsal.speed_accuracy import choose_within_budget, described, front_of, load_points
 
@@ -219,5 +235,8 @@ def scene_within_budget(
     front = front_of(load_points(), asked.model)
     _, point, step_ms = choose_within_budget(front, build, asked.budget_ms, asked.error_mm)
     start_taichi(arch)
-    text = f"Chosen: {described(point.setup)}; a step takes {step_ms:.1f} ms here, expected error {point.error_mean_mm:.2f} mm."
+    text = (
+        f"Chosen: {described(point.setup)}; a step takes {step_ms:.1f} ms here, expected error "
+        f"{point.error_mean_mm:.2f} mm."
+    )
     return scene_of(files.scene, point.setup), text

@@ -27,9 +27,11 @@ MOST_TURNED_DEG = 3.0
 
 
 class PoseScans:
-    """Images of one probe at poses, in the order of the calls: first ``images``, then the others of the same pose.
+    """Images of one probe at poses, in the order of the calls: first ``images``, then the others of the same
+    pose.
 
-    ``rows`` describe the images that were saved, ``ms`` are the times of each pose, ``empty`` counts poses that show nothing of the organ.
+    ``rows`` describe the images that were saved, ``ms`` are the times of each pose, ``empty`` counts poses
+    that show nothing of the organ.
     """
 
     def __init__(

@@ -1,4 +1,6 @@
-"""An organ under its probe, advanced step by step: the part of a rehearsal that a process of its own can compute."""
+"""An organ under its probe, advanced step by step: the part of a rehearsal that a process of its own can
+compute.
+"""
 
 import hashlib
 from collections.abc import Callable, Iterator
@@ -50,9 +52,10 @@ class OrganState:
 class PressedOrgan:
     """The solver of a case's organ under its probe.
 
-    Taichi must be initialised, and initialised again for another case, which frees this one. ``on_wrench`` is called after each
-    ``timed_step`` with the transducer's pose (4, 4) and the ``wrench``, at the rate of the steps: for a haptic device. ``serial`` says
-    whether a step is computed on one core; left open, the body's size and the machine decide.
+    Taichi must be initialised, and initialised again for another case, which frees this one. ``on_wrench`` is
+    called after each ``timed_step`` with the transducer's pose (4, 4) and the ``wrench``, at the rate of the
+    steps: for a haptic device. ``serial`` says whether a step is computed on one core; left open, the body's
+    size and the machine decide.
     """
 
     on_wrench: Callable[[np.ndarray, np.ndarray], None] | None = None
@@ -102,7 +105,8 @@ class PressedOrgan:
         )
 
     def settle(self) -> OrganState:
-        """Let the organ come to rest on its support with the transducer far away: the paper's warm-up. Return that state.
+        """Let the organ come to rest on its support with the transducer far away: the paper's warm-up. Return
+        that state.
 
         It is computed once for the same scene, probe and anatomy.
         """
@@ -122,7 +126,10 @@ class PressedOrgan:
         return state.body.position, state.body.velocity, *state.history.values()
 
     def come_to_rest(self) -> None:
-        """The paper's warm-up, from the present state. The patient has lain for long, so that the tissue relaxes wholly."""
+        """The paper's warm-up, from the present state.
+
+        The patient has lain for long, so that the tissue relaxes wholly.
+        """
         relaxation = getattr(self.model, "relaxation", None)
         for _ in range(self.case.press.warm_up_steps):
             self.advance(self.pose)
@@ -189,7 +196,9 @@ class PressedOrgan:
     def timed_step(
         self, pose: np.ndarray, length_s: float | None = None, iterations: int | None = None
     ) -> tuple[float, np.ndarray | None]:
-        """Advance by a step of a length [s] with so many iterations, where given; return the time that it took [ms], and the wrench."""
+        """Advance by a step of a length [s] with so many iterations, where given; return the time that it
+        took [ms], and the wrench.
+        """
         took_ms: list[float] = []
         with self.step_of(length_s or self.settings.time_step_s, iterations or self.settings.iterations):
             timed(partial(self.advance, pose), took_ms)
@@ -199,8 +208,9 @@ class PressedOrgan:
         return took_ms[0], wrench
 
     def wrench(self) -> np.ndarray | None:
-        """Force (3,) [N] of the tissue on the probe after the last step, and its torque (3,) [N mm] about the centre of the array face, along the
-        patient's axes (LPS); None for a tissue model whose contacts have no forces.
+        """Force (3,) [N] of the tissue on the probe after the last step, and its torque (3,) [N mm] about the
+        centre of the array face, along the patient's axes (LPS); None for a tissue model whose contacts have
+        no forces.
         """
         if not isinstance(self.contacts, SurfaceContacts):
             return None
@@ -224,11 +234,15 @@ class PressedOrgan:
         """Raises ResectionError for a tissue model that cannot be cut."""
         if not isinstance(self.model, NeoHookean):
             raise ResectionError(
-                f"tissue of the model {self.case.scene.tissue.model} cannot be cut; choose --model neo-hookean"
+                f"tissue of the model {self.case.scene.tissue.model} cannot be cut; choose --model "
+                "neo-hookean"
             )
 
     def apply_cut(self, cut: Cut | None) -> None:
-        """Cut the whole organ, or with None restore it. The tissue's state stays as it is. Raises ResectionError."""
+        """Cut the whole organ, or with None restore it.
+
+        The tissue's state stays as it is. Raises ResectionError.
+        """
         if cut is self.cut:
             return
         self.check_can_be_cut()
@@ -249,7 +263,9 @@ class PressedOrgan:
 def attachments_of(
     attachment: Attachment, origin: np.ndarray, press_direction: np.ndarray
 ) -> tuple[list[FixedRegion], list[Tether]]:
-    """What a scene's attachment fixes and what holds it elastically, relative to an origin; fat leaves the pressed side free."""
+    """What a scene's attachment fixes and what holds it elastically, relative to an origin; fat leaves the
+    pressed side free.
+    """
     fixed: list[FixedRegion] = []
     tethers: list[Tether] = []
     if attachment.radius_mm > 0 and attachment.at_mm is not None:
@@ -264,7 +280,10 @@ def attachments_of(
 
 
 def parts_of(case: Case) -> list[Part]:
-    """The parts of the organ that have their own material, in the order of ``PartName``. Raises SceneError."""
+    """The parts of the organ that have their own material, in the order of ``PartName``.
+
+    Raises SceneError.
+    """
     materials = getattr(case.scene.tissue, "parts", {})
     surfaces = {**case.parts, **({} if case.tumour is None else {TUMOUR: case.tumour})}
     parts = []

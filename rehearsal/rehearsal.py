@@ -29,10 +29,12 @@ from ultrasound.scanner import Scanner
 
 
 class Rehearsal:
-    """A case at rest with the transducer just touching; ``do`` applies a command and shows the frame after it.
+    """A case at rest with the transducer just touching; ``do`` applies a command and shows the frame after
+    it.
 
-    ``organ`` is the solver's side, ``anatomy`` what a frame shows of it, ``manipulator`` moves the transducer over the settled surface.
-    ``needs_b_mode`` prepares the B-mode image while the model is built. Taichi must be initialised. Raises UserError.
+    ``organ`` is the solver's side, ``anatomy`` what a frame shows of it, ``manipulator`` moves the transducer
+    over the settled surface. ``needs_b_mode`` prepares the B-mode image while the model is built. Taichi must
+    be initialised. Raises UserError.
     """
 
     def __init__(
@@ -78,13 +80,19 @@ class Rehearsal:
         detail_level: DetailLevel = "speckle",
         shape: tuple[int, int] | None = None,
     ) -> dict[str, np.ndarray]:
-        """What the probe sees now: images uint8 of a shape (rows, columns), the scene's by default, by name. Raises UserError without a CT."""
+        """What the probe sees now: images uint8 of a shape (rows, columns), the scene's by default, by name.
+
+        Raises UserError without a CT.
+        """
         image = self.case.scene.image
         shown = self.anatomy.image_plane(), self.case.probe, mode, detail_level
         return self._scanner.images(*shown, image.window_hu, image.level_hu, shape).by_name
 
     def labels(self) -> np.ndarray:
-        """Ground truth of the last images (rows, columns) uint8: see ``ultrasound.ground_truth_labels``. Raises UserError without a CT."""
+        """Ground truth of the last images (rows, columns) uint8: see ``ultrasound.ground_truth_labels``.
+
+        Raises UserError without a CT.
+        """
         return self._scanner.ground_truth.render()
 
     @property
@@ -110,7 +118,9 @@ class Rehearsal:
         return advanced(self.manipulator.home, depth_mm)
 
     def scripted_pose(self, time_s: float) -> np.ndarray:
-        """The transducer's pose at a time of the scripted press: touching at first, then deeper stage by stage."""
+        """The transducer's pose at a time of the scripted press: touching at first, then deeper stage by
+        stage.
+        """
         return scripted_pose(self.case, self.manipulator, time_s)
 
     def indentation_mm(self) -> float:
@@ -119,7 +129,9 @@ class Rehearsal:
 
 
 def begin(case: Case, anatomy: DeformedAnatomy, stepper: Stepper) -> ProbeManipulator:
-    """Begin a session with the tissue as it has settled and the transducer just touching; return what moves the transducer."""
+    """Begin a session with the tissue as it has settled and the transducer just touching; return what
+    moves the transducer.
+    """
     anatomy.show(stepper.newest())
     manipulator = case.manipulator(anatomy.vertices)
     stepper.submit(NewSession(pose=manipulator.pose()))
@@ -146,9 +158,11 @@ def open_rehearsal(
     changes: Mapping[str, Any] = MappingProxyType({}),
     arch: str = "cpu",
 ) -> Rehearsal:
-    """A rehearsal of a scene file or a patient's folder, for a Python program: with a preset, and values of the scene changed by key.
+    """A rehearsal of a scene file or a patient's folder, for a Python program: with a preset, and values of
+    the scene changed by key.
 
-    Taichi starts anew, which frees what a rehearsal before had: one is open at a time in a process. Raises UserError, NoDevice.
+    Taichi starts anew, which frees what a rehearsal before had: one is open at a time in a process. Raises
+    UserError, NoDevice.
     """
     path = scene_file(Path(scene))
     loaded = with_quality(with_options(load_scene(path), changes), quality)

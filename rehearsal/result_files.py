@@ -33,7 +33,9 @@ def counted(number: int, name: str) -> str:
 
 
 def next_number(folder: Path, pattern: str) -> int:
-    """One more than the highest number in a folder's file names that match a pattern in full; the number is its first group."""
+    """One more than the highest number in a folder's file names that match a pattern in full; the number
+    is its first group.
+    """
     numbers = [int(found[1]) for path in folder.glob("*") if (found := re.fullmatch(pattern, path.name))]
     return 1 + max(numbers, default=0)
 

@@ -60,8 +60,9 @@ LAST_STATE_S = 2.0
 
 @dataclass
 class Built:
-    """A case ready to be rehearsed: its stepper, what a frame shows of it, and what moves the transducer; ``counts`` and ``serial`` are
-    those of its tissue model. ``rehearsal`` is there where the steps are made in this process.
+    """A case ready to be rehearsed: its stepper, what a frame shows of it, and what moves the transducer;
+    ``counts`` and ``serial`` are those of its tissue model. ``rehearsal`` is there where the steps are made
+    in this process.
     """
 
     anatomy: DeformedAnatomy
@@ -74,7 +75,8 @@ class Built:
 
 @dataclass
 class RehearsalRun:
-    """One rehearsal, its anatomy as loaded, the backend's name, what the user asked for, and the files that were read for it.
+    """One rehearsal, its anatomy as loaded, the backend's name, what the user asked for, and the files that
+    were read for it.
 
     ``viewer`` is the window, if there is one. ``build_s`` is the time that building took.
     """
@@ -99,7 +101,8 @@ class RehearsalRun:
         self.resection = ResectionView(self.anatomy, self.files.resection_plan)
 
     def in_window(self, prepare: Callable[[WindowLoop], None] = lambda loop: None) -> None:
-        """Run in the window, after a replay if there is one; ``prepare`` is called with its loop before the first frame.
+        """Run in the window, after a replay if there is one; ``prepare`` is called with its loop before the
+        first frame.
 
         Raises SessionError, SolverEnded.
         """
@@ -108,7 +111,10 @@ class RehearsalRun:
         viewer, log = self.viewer, self.files.log
         check = None if log is None else ReplayCheck(log, self.notices)
         source = self._user() if log is None else self._replay_in_window(log, viewer.settings, check)
-        text = f"The window is open, {self.start.now_s:.0f} s after the start; {{help}} shows the keys, {{quit}} quits."
+        text = (
+            f"The window is open, {self.start.now_s:.0f} s after the start; {{help}} shows the keys, "
+            f"{{quit}} quits."
+        )
         click.echo(self.files.keys.worded(text))
         announcements = Announcements(self.anatomy, self.notices)
         plans = PlanControl(self.anatomy.case, self.loaded, self.measurements, self.asked.out, self.notices)
@@ -141,7 +147,10 @@ class RehearsalRun:
             self.notices.present(self.files.keys.worded)
 
     def headless(self) -> None:
-        """Run the scripted press, a replay or recorded poses to their end. Raises CommandError, SessionError."""
+        """Run the scripted press, a replay or recorded poses to their end.
+
+        Raises CommandError, SessionError.
+        """
         rehearsal, log = self.built.rehearsal, self.files.log
         if rehearsal is None:
             raise ValueError("expected the solver in this process")
@@ -173,7 +182,9 @@ class RehearsalRun:
             run_headless(loop, steps, self.arch, self.asked.out, draws, self.files.resection_plan, about)
 
     def _observers(self, announcements: Announcements, check: ReplayCheck | None) -> list[Observer]:
-        """Those of each frame, in this order: beside a whole state the coverage is recorded, with the image of that state."""
+        """Those of each frame, in this order: beside a whole state the coverage is recorded, with the
+        image of that state.
+        """
         self.recording = Recording(self, is_replay=check is not None)
         observers: list[Observer] = [self.measurements, self.recording, announcements]
         return observers if check is None else [*observers, check]
@@ -312,7 +323,10 @@ class RehearsalRun:
 
 
 class Recording:
-    """An ``Observer``: records each session of a run in a file of its own. A replay is not recorded, but what follows it is."""
+    """An ``Observer``: records each session of a run in a file of its own.
+
+    A replay is not recorded, but what follows it is.
+    """
 
     def __init__(self, run: RehearsalRun, is_replay: bool) -> None:
         self._run = run
@@ -355,7 +369,8 @@ class Recording:
         except OSError as error:
             self.recorder = None
             click.echo(
-                f"Warning: this session is not recorded: {run.asked.out} cannot be written to ({error.strerror})"
+                f"Warning: this session is not recorded: {run.asked.out} cannot be written to "
+                f"({error.strerror})"
             )
         run.measurements.note = self._note
 
@@ -365,13 +380,18 @@ class Recording:
 
 
 def replay_warning(header: Header, arch: str) -> str:
-    """Why a replay may differ in bits from the recording: another version or backend; empty if both are the same."""
+    """Why a replay may differ in bits from the recording: another version or backend; empty if both are
+    the same.
+    """
     if header.version not in (None, VERSION):
         return (
             f"Warning: recorded by version {header.version}, replayed by {VERSION}: the results may differ."
         )
     if header.arch != arch:
-        return f"Warning: recorded on {header.arch}, replayed on {arch}: the same up to rounding, not bit for bit."
+        return (
+            f"Warning: recorded on {header.arch}, replayed on {arch}: the same up to rounding, not bit "
+            "for bit."
+        )
     return ""
 
 
@@ -381,7 +401,10 @@ def _verdict(check: ReplayCheck | None, frame: Frame) -> str:
         return ""
     if check.differs_s is not None:
         return f"replay    differs from {check.differs_s:.1f} s on: other bits, of another backend or version"
-    return f"replay    identical in all {check.compared} states compared, to {check.compared_s:.1f} s; state {check.digest}"
+    return (
+        f"replay    identical in all {check.compared} states compared, to {check.compared_s:.1f} s; "
+        f"state {check.digest}"
+    )
 
 
 def _echo(text: str) -> None:

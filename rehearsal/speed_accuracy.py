@@ -1,4 +1,6 @@
-"""The speed-accuracy points measured by ``study trade``, their Pareto front, and the best point of it for a budget on this machine."""
+"""The speed-accuracy points measured by ``study trade``, their Pareto front, and the best point of it for
+a budget on this machine.
+"""
 
 import json
 from collections.abc import Callable, Sequence
@@ -18,7 +20,8 @@ if TYPE_CHECKING:
 # Written by ``study trade``, copied here whole.
 MEASURED = Path(__file__).with_suffix(".json")
 SETTINGS = ("radius_mm", "cell_mm", "stiffness", "substeps", "iterations", "relaxation_factor")
-# Settings farther from every measured point than this factor in resolution times iterations have no expected error.
+# Settings farther from every measured point than this factor in resolution times iterations have no expected
+# error.
 NEAR = 1.6
 # The press that measures the time of a step on this machine.
 TRIAL_MM, TRIAL_STEPS = 8.0, 40
@@ -58,7 +61,9 @@ def preset_of(setup: Setup) -> str:
 
 
 def pareto(ms: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Which (n,) of some points no other is at least as good as in both times (n,) and errors (n,), and better in one."""
+    """Which (n,) of some points no other is at least as good as in both times (n,) and errors (n,), and
+    better in one.
+    """
     no_worse = (ms[:, None] <= ms) & (error[:, None] <= error)
     better = (ms[:, None] < ms) | (error[:, None] < error)
     return np.logical_not((no_worse & better).any(axis=0))
@@ -100,15 +105,17 @@ def choose_within_budget(
 ) -> tuple["Rehearsal", Point, float]:
     """A rehearsal within the budgets, its point, and the time of a step measured here [ms].
 
-    With a time alone it is the truest that keeps it, with an error the fastest that keeps that. The front's times are
-    another machine's and another organ's: a first trial says how much longer steps take here. Raises NoPoint.
+    With a time alone it is the truest that keeps it, with an error the fastest that keeps that. The front's
+    times are another machine's and another organ's: a first trial says how much longer steps take here.
+    Raises NoPoint.
     """
     front = sorted(front, key=lambda point: point.ms_median)
     allowed = [point for point in front if error_mm is None or point.error_mean_mm <= error_mm]
     if not allowed:
         best = min(point.error_mean_mm for point in front)
         raise NoPoint(
-            f"--error-mm {error_mm:g}: the least mean error that was measured is {best:.3f} mm; ask for that or more"
+            f"--error-mm {error_mm:g}: the least mean error that was measured is {best:.3f} mm; ask for that "
+            "or more"
         )
 
     def tried(at: int) -> tuple["Rehearsal", float]:
@@ -127,7 +134,8 @@ def choose_within_budget(
     while here_ms > budget_ms:
         if at == 0:
             raise NoPoint(
-                f"--budget-ms {budget_ms:g}: a step of {described(allowed[0].setup)} takes {here_ms:.2f} ms here, and none "
+                f"--budget-ms {budget_ms:g}: a step of {described(allowed[0].setup)} takes {here_ms:.2f} ms "
+                "here, and none "
                 f"that may be chosen is faster; ask for that or more"
             )
         at -= 1

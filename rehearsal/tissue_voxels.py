@@ -12,7 +12,8 @@ from ultrasound.acoustics import TissueVoxels, check_tissues
 def tissue_voxels(
     labels: Grid, anatomy: LoadedAnatomy, ct: Grid, draws: bool, origin: np.ndarray
 ) -> TissueVoxels:
-    """Return the tissue of each voxel, relative to an origin (3,) [mm]: as labelled, and as classified from the CT.
+    """Return the tissue of each voxel, relative to an origin (3,) [mm]: as labelled, and as classified from
+    the CT.
 
     ``draws``: also what no CT shows.
     """
@@ -24,7 +25,10 @@ def tissue_voxels(
 
 
 def stored_tissue_map(labels: Grid, anatomy: LoadedAnatomy, ct: Grid, draws: bool) -> TissueMap:
-    """As ``tissue_map``, but computed only once for the same anatomy, and with its corrections. Raises TissueError."""
+    """As ``tissue_map``, but computed only once for the same anatomy, and with its corrections.
+
+    Raises TissueError.
+    """
     check_tissues(anatomy.tissues | anatomy.corrected_tissues)
     codes = codes_of_labels(labels.voxels, anatomy.tissues)
     found = TissueMap(*stored(tissue_arrays, ct.voxels, codes, anatomy.organ, ct.index_from_mm, int(draws)))

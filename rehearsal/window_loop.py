@@ -1,6 +1,7 @@
 """The window's loop. Each time around:
 
-1. the source gives commands: from the user's controls, a recorded session or a tracked probe; the solver's process takes them;
+1. the source gives commands: from the user's controls, a recorded session or a tracked probe; the solver's
+   process takes them;
 2. while it makes the next step, the observers look at the last frame, and its 3D view is drawn;
 3. the newest frame is shown: surfaces and image plane move;
 4. its image is computed;
@@ -138,7 +139,9 @@ class WindowLoop:
         return view
 
     def _announce_new_kind(self, view: View | None, settings: ScannerSettings) -> None:
-        """Say over the last image that one of a new kind is prepared: compiling its kernels may take seconds."""
+        """Say over the last image that one of a new kind is prepared: compiling its kernels may take
+        seconds.
+        """
         steered = settings.colour_steering_deg != 0
         kind = settings.mode, settings.detail_level, settings.compounding, settings.doppler, steered
         if view is not None and kind not in self._kinds:

@@ -1,4 +1,6 @@
-"""What a window shows beside frame and image: measurements, score, cine, caliper, notices; and the files that the user saves."""
+"""What a window shows beside frame and image: measurements, score, cine, caliper, notices; and the files
+that the user saves.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -45,8 +47,8 @@ HOW_TO_PRESS = "{press} or {push} presses"
 class WindowPanel:
     """Adds to a view what the user reads, and does what the keys ask for that changes no tissue.
 
-    ``folder`` is the scene's: the patient's, where one was imported; ``warnings`` of the import are those that nobody has acknowledged.
-    ``counts`` are the sizes of the tissue model.
+    ``folder`` is the scene's: the patient's, where one was imported; ``warnings`` of the import are those
+    that nobody has acknowledged. ``counts`` are the sizes of the tissue model.
     """
 
     def __init__(
@@ -163,7 +165,9 @@ class WindowPanel:
         return self.measurements.manipulator.indentation_mm(self.anatomy.pose)
 
     def _warnings(self) -> tuple[str, ...]:
-        """The key that acknowledges the warnings of the import, and these: of many, the last are not shown."""
+        """The key that acknowledges the warnings of the import, and these: of many, the last are not
+        shown.
+        """
         shown = tuple(f"Import: {text}" for text in self.warnings)
         return (self.keys.worded(HOW_TO_ACKNOWLEDGE), *shown) if shown else ()
 

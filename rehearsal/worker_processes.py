@@ -1,4 +1,6 @@
-"""Tasks in parallel: on processes of this machine, which end when the one that started them was killed, or on a Dask cluster."""
+"""Tasks in parallel: on processes of this machine, which end when the one that started them was killed, or
+on a Dask cluster.
+"""
 
 import os
 import threading
@@ -36,9 +38,9 @@ class WorkerError(UserError):
 class Workers:
     """Workers for functions of modules, with arguments that can be pickled; a context manager.
 
-    They are ``jobs`` processes on this machine, or one a processor; or those of the Dask cluster of the scheduler at an address,
-    with this project in the PYTHONPATH of all. Even a single process is another one than this, where Taichi may be in use.
-    ``count`` is their number. Raises WorkerError.
+    They are ``jobs`` processes on this machine, or one a processor; or those of the Dask cluster of the
+    scheduler at an address, with this project in the PYTHONPATH of all. Even a single process is another one
+    than this, where Taichi may be in use. ``count`` is their number. Raises WorkerError.
     """
 
     def __init__(self, jobs: int | None = None, dask: str | None = None) -> None:
@@ -59,7 +61,8 @@ class Workers:
         self.stop()
 
     def map(self, function: Callable[..., T], tasks: Iterable[tuple]) -> Iterator[T]:
-        """The results of ``function(*task)`` in the order of the tasks, which do not depend on the number of workers.
+        """The results of ``function(*task)`` in the order of the tasks, which do not depend on the number of
+        workers.
 
         Raises what the function raises, and WorkerError where a worker has ended.
         """
@@ -71,13 +74,17 @@ class Workers:
                 found = done.pop(due)
                 if has_ended(error_of(found)):
                     raise WorkerError(
-                        "a worker process was ended, perhaps for lack of memory; close other programs, or give fewer --jobs"
+                        "a worker process was ended, perhaps for lack of memory; close other programs, or "
+                        "give fewer --jobs"
                     )
                 yield found.result()
                 due += 1
 
     def completed(self, function: Callable[..., T], tasks: Iterable[tuple]) -> Iterator[tuple[int, Future]]:
-        """The number of each task and its future, as soon as it has ended. Tasks are taken as there is a worker for them soon."""
+        """The number of each task and its future, as soon as it has ended.
+
+        Tasks are taken as there is a worker for them soon.
+        """
         left, running = enumerate(tasks), dict[Future, int]()
         # With more tasks queued than its processes soon take, loky's own thread fails when it is stopped.
         most, is_more = 2 * self.count, True
@@ -103,11 +110,16 @@ class Workers:
             return refused
 
     def share(self, value: T) -> T:
-        """A large argument of many tasks, sent once to each worker of a cluster. It must be an argument of its own."""
+        """A large argument of many tasks, sent once to each worker of a cluster.
+
+        It must be an argument of its own.
+        """
         return value if self._client is None else self._client.scatter(value, broadcast=True)
 
     def stop(self) -> None:
-        """End the tasks, and the processes of this machine; a thread that waits for them gets a WorkerError."""
+        """End the tasks, and the processes of this machine; a thread that waits for them gets a
+        WorkerError.
+        """
         if self._client is None:
             self._executor.shutdown(wait=False, kill_workers=True)  # type: ignore[call-arg]
         else:
@@ -136,7 +148,8 @@ def _connect(dask: str) -> tuple[Any, int]:
     except Exception as error:  # any exception of scheduler or worker
         client.close()
         raise WorkerError(
-            f"--dask {dask}: scheduler or worker is not ready ({error}); start both with this project's requirements "
+            f"--dask {dask}: scheduler or worker is not ready ({error}); start both with this project's "
+            "requirements "
             f"installed and its folder in PYTHONPATH"
         ) from None
     if not ready:
@@ -162,7 +175,8 @@ _built: dict[Hashable, Any] = {}
 
 
 def built_once(key: Hashable, build: Callable[[], T], most: int = 1) -> T:
-    """What this worker keeps from task to task: what was built under this key, or is built now, on one CPU thread of Taichi.
+    """What this worker keeps from task to task: what was built under this key, or is built now, on one CPU
+    thread of Taichi.
 
     Taichi starts anew for it, and all else is lost, where already ``most`` are kept.
     """
@@ -203,7 +217,8 @@ def end_with_parent(parent: int) -> None:
 
 
 def _watch(parent: int) -> None:
-    # An orphan has another parent, or none. The id of a killed parent may still exist, until somebody waits for it.
+    # An orphan has another parent, or none. The id of a killed parent may still exist, until somebody waits
+    # for it.
     while (found := psutil.Process().parent()) is not None and found.pid == parent:
         time.sleep(WATCH_S)
     os._exit(1)

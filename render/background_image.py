@@ -1,4 +1,5 @@
-"""The image behind the 3D view: ultrasound panel, title, clock, help, read-outs, findings and compass. Images are uint8 (height, width, 3).
+"""The image behind the 3D view: ultrasound panel, title, clock, help, read-outs, findings and compass. Images
+are uint8 (height, width, 3).
 
 Each frame redraws only what changed.
 """
@@ -84,7 +85,8 @@ class BackgroundImage:
         taken: int = 0,
         slow_figures: bool = False,
     ) -> None:
-        """Draw a view, with the compass for a camera's axes (3, 3): right, up and ahead, in patient coordinates.
+        """Draw a view, with the compass for a camera's axes (3, 3): right, up and ahead, in patient
+        coordinates.
 
         Sliders beside the warnings have ``taken`` so many pixels at the right of the 3D view.
         With ``slow_figures``, figures change only every READOUT_PERIOD_S, so that they can be read.
@@ -288,7 +290,9 @@ def readout_image(layout: WindowLayout, readouts: Mapping[str, str]) -> np.ndarr
 
 
 def findings_image(layout: WindowLayout, findings: Mapping[str, str], alert: str = "") -> np.ndarray:
-    """Return names and values, uint8, shape of layout.findings(count); the one named ``alert`` is highlighted."""
+    """Return names and values, uint8, shape of layout.findings(count); the one named ``alert`` is
+    highlighted.
+    """
     box = layout.findings(len(findings))
     image = Image.new("RGB", (box.width, box.height), FINDINGS)
     draw = ImageDraw.Draw(image)
@@ -323,7 +327,8 @@ def _draw_figures(
 
 
 def ends_of(axes: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    """Return the letters of the patient's axes and their directions on the screen (2,), right and up, the farthest first.
+    """Return the letters of the patient's axes and their directions on the screen (2,), right and up, the
+    farthest first.
 
     ``axes`` (3, 3) are the camera's right, up and ahead, in the patient.
     """
@@ -337,7 +342,9 @@ def ends_of(axes: np.ndarray) -> list[tuple[str, np.ndarray]]:
 
 
 def are_apart(places: np.ndarray, least: float) -> list[bool]:
-    """Whether each of some places (n, 2), the nearest last, is at least so far from all nearer ones for which that is true."""
+    """Whether each of some places (n, 2), the nearest last, is at least so far from all nearer ones for
+    which that is true.
+    """
     free: list[np.ndarray] = []
     apart = []
     for place in places[::-1]:

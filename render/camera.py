@@ -103,7 +103,10 @@ class OrbitCamera:
         return 0.5 + 0.5 * plane / self.half_extent()
 
     def orbit(self, across: float, along: float) -> None:
-        """Turn by a drag of the mouse, in window coordinates. The poles are excluded: up is undefined there."""
+        """Turn by a drag of the mouse, in window coordinates.
+
+        The poles are excluded: up is undefined there.
+        """
         self.azimuth_deg += 220.0 * across
         self.elevation_deg = float(np.clip(self.elevation_deg - 160.0 * along, -80.0, 85.0))
 

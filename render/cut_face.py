@@ -20,15 +20,17 @@ EDGE_ON = 0.2
 
 
 def side_of_eye(pose: np.ndarray, eye: np.ndarray, before: float) -> float:
-    """Return the side of the image plane of a pose (4, 4) that the eye is on, 1 or -1; edge on, the side ``before`` (0: none)."""
+    """Return the side of the image plane of a pose (4, 4) that the eye is on, 1 or -1; edge on, the side
+    ``before`` (0: none).
+    """
     toward = (eye - pose[:3, 3]) / np.linalg.norm(eye - pose[:3, 3])
     sine = float(toward @ pose[:3, 1])
     return before if before and abs(sine) < EDGE_ON else float(np.copysign(1.0, sine))
 
 
 def oriented_section(vertices: np.ndarray, faces: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return the section of a closed surface (n, 3), (m, 3) with the image plane of a pose (4, 4): segments (k, 2, 2) along the
-    pose's x and z, all in the same sense around the inside."""
+    """Return the section of a closed surface (n, 3), (m, 3) with the image plane of a pose (4, 4): segments
+    (k, 2, 2) along the pose's x and z, all in the same sense around the inside."""
     local = (vertices - pose[:3, 3]) @ pose[:3, :3]
     below = local[:, 1] < 0
     cut = faces[below[faces].any(axis=1) & ~below[faces].all(axis=1)]
@@ -63,7 +65,9 @@ class Raster:
         return self.low + np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
 
     def covered(self, segments: np.ndarray) -> np.ndarray:
-        """Return the covered fraction of each cell inside segments (k, 2, 2) of one sense, shape (count, count), by rows."""
+        """Return the covered fraction of each cell inside segments (k, 2, 2) of one sense, shape (count,
+        count), by rows.
+        """
         start, end = np.moveaxis((segments - self.low) / self.width, 1, 0)
         low, high = np.sort(np.stack([start[:, 1], end[:, 1]]), axis=0)
         first = np.ceil(low).astype(int)
@@ -72,7 +76,8 @@ class Raster:
         row = first[which] + np.arange(len(which)) - np.repeat(np.cumsum(times) - times, times)
         run = end[which] - start[which]
         at = start[which, 0] + (row - start[which, 1]) / run[:, 1] * run[:, 0]
-        # Scan conversion: along a row, a segment that goes up enters the surface, one that goes down leaves it, or the reverse.
+        # Scan conversion: along a row, a segment that goes up enters the surface, one that goes down leaves
+        # it, or the reverse.
         sense, column = np.sign(run[:, 1]), np.floor(at + 0.5).astype(int)
         change = np.zeros((self.count, self.count + 1))
         part = column + 0.5 - at
@@ -94,7 +99,9 @@ class CutFace:
     def draw(
         self, scene, organ: ShadedSurface, inner: list[ShadedSurface], pose: np.ndarray, key: np.ndarray
     ) -> None:
-        """Draw the section on the image plane of a pose (4, 4) into a scene, evenly lit by a light at ``key`` (3,)."""
+        """Draw the section on the image plane of a pose (4, 4) into a scene, evenly lit by a light at
+        ``key`` (3,).
+        """
         cuts = [oriented_section(array_of(each.vertices), each.faces, pose) for each in (organ, *inner)]
         raster = Raster.around(cuts, CELLS)
         covered = [raster.covered(each).reshape(-1, 1) for each in cuts]

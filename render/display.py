@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 from render.window_layout import FULL_SIZE, MOST_SCALE
 
-# Fraction of a small screen's height for a window below its title and a task bar; its width is a multiple of STEP.
+# Fraction of a small screen's height for a window below its title and a task bar; its width is a multiple of
+# STEP.
 HEIGHT_FRACTION, STEP = 0.88, 64
 # Dots per inch at scale 1.
 USUAL_DPI = 96
@@ -47,7 +48,9 @@ def window_size() -> tuple[int, int]:
 
 
 def fitted(width: int, height: int, scale: float = 1.0) -> tuple[int, int]:
-    """Return the size of a window on a screen of a size [pixels]: FULL_SIZE, enlarged by the screen's scale, or as large as fits."""
+    """Return the size of a window on a screen of a size [pixels]: FULL_SIZE, enlarged by the screen's
+    scale, or as large as fits.
+    """
     room = min(width, HEIGHT_FRACTION * height * FULL_SIZE[0] / FULL_SIZE[1])
     wide = int(min(scale * FULL_SIZE[0], room)) // STEP * STEP
     return wide, wide * FULL_SIZE[1] // FULL_SIZE[0]
@@ -88,6 +91,8 @@ def _of_x11(display: str | None) -> X11Screen | None:
 
 
 def scale_of(resources: bytes) -> float:
-    """Return the scale in the resources of an X server, where desktops set it: Xft.dpi, from 96; 1 where it is not there."""
+    """Return the scale in the resources of an X server, where desktops set it: Xft.dpi, from 96; 1 where
+    it is not there.
+    """
     found = re.search(rb"^Xft\.dpi:\s*(\d+(\.\d+)?)", resources, re.MULTILINE)
     return min(max(float(found[1]) / USUAL_DPI, 1.0), MOST_SCALE) if found else 1.0

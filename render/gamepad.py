@@ -11,7 +11,8 @@ from render.keys import BUTTONS, TILT_DEG_S, begin, hold
 from render.viewer import Controls
 
 SLIDE_MM_S = 40.0
-# Dead zones: sticks and triggers at rest are not exactly at 0. A power law makes a stick fine near its centre.
+# Dead zones: sticks and triggers at rest are not exactly at 0. A power law makes a stick fine near its
+# centre.
 DEAD_STICK, DEAD_TRIGGER = 0.15, 0.05
 STICK_POWER = 2.0
 # SDL's game controllers of any make: axes of the sticks (down is positive) and of the right trigger.
@@ -21,7 +22,9 @@ FULL = 32767
 
 @dataclass(frozen=True)
 class PadState:
-    """Sticks (right and up are positive) from -1 to 1, the right trigger from 0 to 1, buttons by their names."""
+    """Sticks (right and up are positive) from -1 to 1, the right trigger from 0 to 1, buttons by their
+    names.
+    """
 
     left: tuple[float, float] = (0.0, 0.0)
     right: tuple[float, float] = (0.0, 0.0)
@@ -33,7 +36,9 @@ class PadState:
 
 
 class Gamepad:
-    """Left stick: slide; right stick: rock and tilt; right trigger: press; ``buttons`` are action -> button."""
+    """Left stick: slide; right stick: rock and tilt; right trigger: press; ``buttons`` are action ->
+    button.
+    """
 
     def __init__(self, pads: SdlPads, buttons: Mapping[str, str]) -> None:
         self._pads, self._buttons = pads, buttons
@@ -64,7 +69,9 @@ class Gamepad:
 
 
 def shaped(x: float, y: float) -> tuple[float, float]:
-    """Return a stick's deflection without its dead zone, fine near the centre, of length 1 at most, in the same direction."""
+    """Return a stick's deflection without its dead zone, fine near the centre, of length 1 at most, in the
+    same direction.
+    """
     length = math.hypot(x, y)
     if length <= DEAD_STICK:
         return 0.0, 0.0

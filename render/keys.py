@@ -107,8 +107,8 @@ HELD = {
     "tilt_back": ("tilt_deg", -TILT_DEG_S),
     "tilt_forward": ("tilt_deg", TILT_DEG_S),
 }
-# The others act when the key goes down: cine steps, settings of several values, settings that are on or off, and controls with the
-# name of the action.
+# The others act when the key goes down: cine steps, settings of several values, settings that are on or off,
+# and controls with the name of the action.
 STEPS = {"cine_back": -1, "cine_forth": 1}
 CYCLES = {
     "mode": MODES,
@@ -121,7 +121,8 @@ CYCLES = {
 VIEW_ACTIONS = ("zoom_in", "zoom_out")
 
 SECTIONS = "unknown key; expected the sections [keys] and [gamepad]"
-HEAD = """# The keys of Nephron's window: change some, leave out the rest, and give the file to rehearse --keys.
+HEAD = """\
+# The keys of Nephron's window: change some, leave out the rest, and give the file to rehearse --keys.
 # A key is a letter, where a US keyboard has it, or {named}; or one of these with Shift, such as Shift+M.
 # A gamepad's button is {buttons}.
 """
@@ -146,7 +147,10 @@ class Keys:
     buttons: Mapping[str, str] = field(default_factory=lambda: DEFAULT_BUTTONS)
 
     def action_of(self, pressed: str, with_shift: bool = False) -> str:
-        """Return the action of a key, as GGUI names it; empty where it has none. A key that has none with shift has its usual one."""
+        """Return the action of a key, as GGUI names it; empty where it has none.
+
+        A key that has none with shift has its usual one.
+        """
         names = (WITH_SHIFT + pressed, pressed) if with_shift else (pressed,)
         of = {KEYS[key]: action for action, key in self.of.items()}
         return next((of[name] for name in names if name in of), "")

@@ -1,4 +1,5 @@
-"""The 3D view: organ, internal structures, support, transducer, image plane and planned sweep in a GGUI scene.
+"""The 3D view: organ, internal structures, support, transducer, image plane and planned sweep in a GGUI
+scene.
 
 The scene is a parameter: graphics_scene.py or software_scene.py. Lengths in mm.
 """
@@ -33,7 +34,10 @@ MAX_SCORE, MAX_MARKS, MARK_MM, SCORE_LIFT_MM, SCORE_WIDTH = 600, 200, 1.2, 0.6, 
 
 
 class SceneView:
-    """Fields of the drawn objects; ``draw`` draws them all. ``before`` is the view of other geometry that this one replaces."""
+    """Fields of the drawn objects; ``draw`` draws them all.
+
+    ``before`` is the view of other geometry that this one replaces.
+    """
 
     def __init__(self, geometry: Geometry, camera: OrbitCamera, before: "SceneView | None" = None):
         self.camera = camera
@@ -134,7 +138,9 @@ class SceneView:
             surface.draw(scene, None if cut is None else ahead, cut)
 
     def _mask(self, scene, masked) -> None:
-        """Draw quads of alpha 0 just behind the near plane: the background stays visible, what is drawn later is hidden."""
+        """Draw quads of alpha 0 just behind the near plane: the background stays visible, what is drawn
+        later is hidden.
+        """
         if len(masked) > MASKS:
             raise ValueError(f"{len(masked)} boxes to mask: at most {MASKS} are expected")
         corners = np.full((MASKS, 6, 2), -1.0)
@@ -183,7 +189,10 @@ class SceneView:
 
 
 class PlanLines:
-    """A planned sweep: the path of the array face, and the outline of the probe at the next pose. Of a path of more than MAX_SEGMENTS only every n-th segment is drawn."""
+    """A planned sweep: the path of the array face, and the outline of the probe at the next pose.
+
+    Of a path of more than MAX_SEGMENTS only every n-th segment is drawn.
+    """
 
     def __init__(self, edges: np.ndarray) -> None:
         self._edges = edges
@@ -214,7 +223,9 @@ class PlanLines:
 
 
 class ScoreLines:
-    """The closed line of the score and its marks; of a line of more than MAX_SCORE points only every n-th is drawn."""
+    """The closed line of the score and its marks; of a line of more than MAX_SCORE points only every n-th
+    is drawn.
+    """
 
     def __init__(self) -> None:
         self._points, self._colours = (zeros(4 * (MAX_SCORE + MAX_MARKS), 3, within=1) for _ in range(2))

@@ -1,4 +1,6 @@
-"""Sliders and switches from the metadata of ``Settings``: in the strip under the 3D view; the scanner's beside the panel."""
+"""Sliders and switches from the metadata of ``Settings``: in the strip under the 3D view; the scanner's
+beside the panel.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -6,8 +8,8 @@ from collections.abc import Mapping
 from render.viewer import B_MODE, DOPPLER, RESECTION, SCANNER_GROUPS, TGC, Geometry, Settings
 from render.window_layout import Rect, WindowLayout
 
-# Dear ImGui's glyphs are 7 pixels wide, its rows 23 pixels high. A slider's label gets 35 % of a box, a switch's all of it, less
-# these pixels around them.
+# Dear ImGui's glyphs are 7 pixels wide, its rows 23 pixels high. A slider's label gets 35 % of a box, a
+# switch's all of it, less these pixels around them.
 GLYPH_WIDTH, LABEL_SHARE, ROW_HEIGHT, AROUND_ROWS = 7, 0.35, 23, 32
 AROUND_LABEL, AROUND_SWITCH = 16, 35
 # The least width of a box beside the panel.
@@ -28,7 +30,10 @@ def groups_of(settings: Settings, geometry: Geometry) -> dict[str, list[dataclas
 
 
 def boxes_of(settings: Settings, geometry: Geometry, layout: WindowLayout) -> dict[str, Rect]:
-    """Return the box of each group. Where boxes would be too narrow for their labels, the first are left out."""
+    """Return the box of each group.
+
+    Where boxes would be too narrow for their labels, the first are left out.
+    """
     groups = groups_of(settings, geometry)
     widths = {name: _width(members) for name, members in groups.items() if name not in SCANNER_GROUPS}
     while len(widths) > 1 and sum(widths.values()) > layout.slider_room(len(widths)):
@@ -49,8 +54,8 @@ def draw_sliders(
 ) -> None:
     """Draw the groups that have a box, and update the settings from them.
 
-    GGUI measures in fractions of the window's first size. A box stays where the user moved it, and is never freed: there is a new one only
-    in a new place, or where the user ``moved`` it once more.
+    GGUI measures in fractions of the window's first size. A box stays where the user moved it, and is never
+    freed: there is a new one only in a new place, or where the user ``moved`` it once more.
     """
     groups = groups_of(settings, geometry)
     width, height = first_size

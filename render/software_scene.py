@@ -1,7 +1,8 @@
 """The 3D view drawn by the processor, with the methods of GGUI's scene that ``scene_view.py`` calls.
 
-Where there is no graphics card, Mesa imitates one at 100 ms a picture; this takes a few. Vertices are lit as by GGUI (Lambert's law),
-triangles drawn in their order with a depth buffer, blended by alpha, and clipped to a box of the window.
+Where there is no graphics card, Mesa imitates one at 100 ms a picture; this takes a few. Vertices are lit as
+by GGUI (Lambert's law), triangles drawn in their order with a depth buffer, blended by alpha, and clipped to
+a box of the window.
 """
 
 from typing import NamedTuple
@@ -15,15 +16,17 @@ from render.window_layout import Rect
 from sim.fields import array_of
 from sim.taichi_internals import TASK
 
-# Each band of columns is drawn by one thread, all triangles in their order: so the picture does not depend on the threads.
+# Each band of columns is drawn by one thread, all triangles in their order: so the picture does not depend on
+# the threads.
 BANDS = 4
 # Farther outside, a column or row is cut off before it becomes an integer.
 MOST_PIXELS = 1e6
-# Lines are drawn this much nearer, as a share of their distance, so that the surface that they are on does not hide them.
+# Lines are drawn this much nearer, as a share of their distance, so that the surface that they are on does
+# not hide them.
 LINE_NEARER = 1e-3
 
-# Points on the screen (n, 3): column and row from the bottom [pixels], and 1 / distance; their colours (n, 4), 0 to 1 and above;
-# triangles (m, 3) of them.
+# Points on the screen (n, 3): column and row from the bottom [pixels], and 1 / distance; their colours (n,
+# 4), 0 to 1 and above; triangles (m, 3) of them.
 Projected = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -38,7 +41,8 @@ class Layer(NamedTuple):
 
 
 class SoftwareScene:
-    """Collects what is drawn from a camera in a window of a size [pixels]; ``render`` draws it into an image and forgets it.
+    """Collects what is drawn from a camera in a window of a size [pixels]; ``render`` draws it into an image
+    and forgets it.
 
     The first mesh, which fills most of the view, is drawn again only if it has changed.
     """
@@ -70,7 +74,9 @@ class SoftwareScene:
         self._lights.append((tuple(position), tuple(colour)))
 
     def mesh(self, vertices, indices: np.ndarray, normals, per_vertex_color, two_sided: bool = False) -> None:
-        """Add triangles of vertex ``indices`` (3 m,); fields (n,) of vertices [mm], normals, and colours with or without alpha."""
+        """Add triangles of vertex ``indices`` (3 m,); fields (n,) of vertices [mm], normals, and colours
+        with or without alpha.
+        """
         given = array_of(vertices), array_of(normals), array_of(per_vertex_color), indices
         if self._drawn:
             self._drawn.append(self._lit(*given, two_sided))
@@ -107,7 +113,9 @@ class SoftwareScene:
         self._drawn.append((corners.reshape(-1, 3), colours.reshape(-1, 4), triangles))
 
     def _projected(self, points: np.ndarray) -> np.ndarray:
-        """The points (n, 3) on the screen; what is nearer than the near plane or behind has a distance of 0."""
+        """The points (n, 3) on the screen; what is nearer than the near plane or behind has a distance of
+        0.
+        """
         local = (points - self._eye) @ self._axes
         near = local[:, 2] < self._near
         nearness = np.where(near, 0.0, 1.0 / np.where(near, 1.0, local[:, 2]))
@@ -116,7 +124,9 @@ class SoftwareScene:
         )
 
     def render(self, box: Rect, pixels: np.ndarray) -> None:
-        """Draw all into a box of the window; ``pixels`` (width, height, 4) uint8 are its columns, bottom up."""
+        """Draw all into a box of the window; ``pixels`` (width, height, 4) uint8 are its columns, bottom
+        up.
+        """
         drawn, columns = self._drawn, pixels.view(np.uint32)[..., 0]
         self._clear()
         rows = slice(self.size[1] - box.bottom, self.size[1] - box.top)
@@ -154,7 +164,9 @@ def _light(
     two_sided: int,
     colours: ti.types.ndarray(ti.f32, ndim=2),
 ):
-    """Multiply colours by the light on each vertex; ``lights`` (1 + n, 2, 3) are eye and ambient light, then places and colours."""
+    """Multiply colours by the light on each vertex; ``lights`` (1 + n, 2, 3) are eye and ambient light,
+    then places and colours.
+    """
     for v in range(points.shape[0]):
         place = tm.vec3(points[v, 0], points[v, 1], points[v, 2])
         normal = tm.vec3(normals[v, 0], normals[v, 1], normals[v, 2]).normalized(1e-12)
@@ -185,7 +197,9 @@ def _draw(
     depth: ti.types.ndarray(ti.f32, ndim=2),
     pixels: ti.types.ndarray(ti.u32, ndim=2),
 ):
-    """Draw triangles in their order into columns left to right - 1 and rows bottom to top - 1, where nearer than ``depth``."""
+    """Draw triangles in their order into columns left to right - 1 and rows bottom to top - 1, where
+    nearer than ``depth``.
+    """
     for n in range(BANDS * TASK):
         if n % TASK == 0:
             band = n // TASK
@@ -211,7 +225,8 @@ def _draw_triangle(
 ):
     """Draw the pixels whose centres are inside: column by column, between the two edges that cross it.
 
-    An edge that two triangles share is computed the same in both, from its left end: no pixel is drawn twice, and none is left out.
+    An edge that two triangles share is computed the same in both, from its left end: no pixel is drawn twice,
+    and none is left out.
     """
     i, j, k = corners[0], corners[1], corners[2]
     # By their column.

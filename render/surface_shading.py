@@ -1,7 +1,8 @@
 """Shading of surfaces, and the drawing order of their faces.
 
-GGUI shades by Lambert's law alone and blends by vertex alpha without sorting. Specular sheen and a rim that stays visible on a
-translucent organ are therefore part of the vertex colours, and faces are sorted farthest first.
+GGUI shades by Lambert's law alone and blends by vertex alpha without sorting. Specular sheen and a rim that
+stays visible on a translucent organ are therefore part of the vertex colours, and faces are sorted farthest
+first.
 """
 
 from typing import Any
@@ -25,7 +26,9 @@ Points: Any = ti.types.ndarray(tm.vec3, ndim=1)
 
 
 class DrawnMesh:
-    """Fields of triangles with a normal and a colour (3 or 4 channels) at each of ``count`` vertices, given anew for each frame."""
+    """Fields of triangles with a normal and a colour (3 or 4 channels) at each of ``count`` vertices,
+    given anew for each frame.
+    """
 
     def __init__(self, count: int, channels: int = 3) -> None:
         self._fields = fields_of(*np.zeros((2, count, 3)), np.zeros((count, channels)), within=1)
@@ -65,7 +68,8 @@ class ShadedSurface:
 
     @kernel
     def _shade(self, places: Points, opacity: float):
-        """``places`` (5,) are the eye, the light, a point of the cut and its normal, and the surface's colour.
+        """``places`` (5,) are the eye, the light, a point of the cut and its normal, and the surface's
+        colour.
 
         A zero normal cuts nothing; else what is on its side of the plane is transparent.
         """
@@ -85,7 +89,8 @@ class ShadedSurface:
             rim = (1.0 - ti.abs(n.dot(to_eye))) ** 2
             alpha = ti.min(opacity + (1.0 - opacity) * (0.75 * rim + sheen), 1.0)
             if cut_normal.norm() > 0.5:
-                # Not clamped: blending clamps each pixel, and a linear alpha is cut along the plane, not along faces.
+                # Not clamped: blending clamps each pixel, and a linear alpha is cut along the plane, not
+                # along faces.
                 alpha = 0.5 - (vertex - cut_point).dot(cut_normal) / CUT_EDGE_MM
             tinted = base + self._tint[v] * (tm.vec3(TINT) - base)
             self.colour[v] = tm.vec4(tinted * (1.0 - 0.25 * rim) + sheen, alpha)
@@ -107,7 +112,9 @@ class ShadedSurface:
         scene.mesh(self.vertices, self.indices(ahead, cut), self.normal, **colours)
 
     def indices(self, ahead: np.ndarray | None = None, cut: Cut | None = None) -> np.ndarray:
-        """Return vertex indices of the faces, int32 (3 m,), farthest first along `ahead` if given, without faces removed by a cut."""
+        """Return vertex indices of the faces, int32 (3 m,), farthest first along `ahead` if given, without
+        faces removed by a cut.
+        """
         if ahead is None:
             return self.faces.reshape(-1)
         vertices, faces = array_of(self.vertices), self.faces

@@ -22,7 +22,9 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def fitting_size(rows: Iterable[tuple[str, ...]], width: int, most: int) -> int:
-    """Return the largest font size, up to ``most``, at which the longest texts of all columns fit beside each other."""
+    """Return the largest font size, up to ``most``, at which the longest texts of all columns fit beside
+    each other.
+    """
     columns = list(zip(*rows, strict=True))
     for size in range(most, LEAST_FONT_PX, -1):
         if sum(max(map(font(size).getlength, column)) for column in columns) <= width:
@@ -59,7 +61,10 @@ def written_size(text: str, size: int) -> tuple[int, int]:
 
 
 def write(page: np.ndarray, box: Rect, centre: tuple[float, float], text: str, size: int, colour) -> None:
-    """Write over an image (rows, columns, 3 or more), centred at (x, y) or shifted into a box. A text larger than the box is left out."""
+    """Write over an image (rows, columns, 3 or more), centred at (x, y) or shifted into a box.
+
+    A text larger than the box is left out.
+    """
     covered = _coverage(text, size)
     rows, columns, _ = covered.shape
     if rows > box.height or columns > box.width:

@@ -1,4 +1,5 @@
-"""The transducer and its image plane as triangles and lines, in the transducer's frame. NumPy only; lengths in mm.
+"""The transducer and its image plane as triangles and lines, in the transducer's frame. NumPy only; lengths
+in mm.
 
 Local axes: x lateral, to the marked side; y elevation; z along the axis. The image plane leaves the face at
 z = -size_z / 2 in the direction -z.
@@ -31,7 +32,9 @@ class TransducerShape(NamedTuple):
 
 
 def _prism(profile: np.ndarray, width: float, colour) -> TransducerShape:
-    """Return the convex prism of a profile (n, 2) of x and z, centred on y = 0; each triangle has its own vertices."""
+    """Return the convex prism of a profile (n, 2) of x and z, centred on y = 0; each triangle has its own
+    vertices.
+    """
     ends = [np.insert(profile, 1, y, axis=1) for y in (-width / 2, width / 2)]
     hull = trimesh.convex.convex_hull(np.concatenate(ends))
     colours = np.tile(colour, (3 * len(hull.faces), 1))
@@ -69,7 +72,9 @@ def _face(x: float, z: float, radius: float) -> np.ndarray:
 
 
 def edges(size, radius: float = 0.0) -> np.ndarray:
-    """Return the end points of the housing's straight edges, shape (24, 3), just outside so that the sides do not hide them."""
+    """Return the end points of the housing's straight edges, shape (24, 3), just outside so that the sides
+    do not hide them.
+    """
     x, y, z = (float(each) for each in size)
     foot = _face(x, z, radius)[:, 1].max()
     box = np.array([x, y, z / 2 - foot])
@@ -83,13 +88,17 @@ def image_plane_grid(rows: int, columns: int) -> np.ndarray:
 
 
 def grid_triangles(rows: int, columns: int) -> np.ndarray:
-    """Return the vertex indices of two triangles in each cell of a grid, int32, shape ((rows - 1)(columns - 1), 6)."""
+    """Return the vertex indices of two triangles in each cell of a grid, int32, shape ((rows - 1)(columns
+    - 1), 6).
+    """
     first = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1, 1)
     return (first + [0, columns, 1, 1, columns, columns + 1]).astype(np.int32)
 
 
 def on_plane(shares: np.ndarray, view: View) -> np.ndarray:
-    """Return points (n, 2) on the image plane [mm] of fractions (n, 2) of scanline and depth: in a rectangle or a sector."""
+    """Return points (n, 2) on the image plane [mm] of fractions (n, 2) of scanline and depth: in a
+    rectangle or a sector.
+    """
     if view.sector is None:
         return (shares - [0.5, 0.0]) * [view.width_mm, view.depth_mm]
     radius, start, stop = view.sector
@@ -99,7 +108,9 @@ def on_plane(shares: np.ndarray, view: View) -> np.ndarray:
 
 
 def on_transducer(places: np.ndarray) -> np.ndarray:
-    """Return points (n, 3) of image plane points (n, 2); the origin is the centre of the face, depth is along -z."""
+    """Return points (n, 3) of image plane points (n, 2); the origin is the centre of the face, depth is
+    along -z.
+    """
     return np.column_stack([places[:, 0], np.zeros(len(places)), -places[:, 1]])
 
 

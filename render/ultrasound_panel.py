@@ -1,6 +1,8 @@
-"""The ultrasound panel as on a scanner: images, ruler, focus, marker dot, settings, outline and caliper. NumPy and Pillow.
+"""The ultrasound panel as on a scanner: images, ruler, focus, marker dot, settings, outline and caliper.
+NumPy and Pillow.
 
-Pixels count from the top left. Points of the image plane are (u, v) [mm]: u from the centre to the right, v down from the face.
+Pixels count from the top left. Points of the image plane are (u, v) [mm]: u from the centre to the right, v
+down from the face.
 """
 
 import numpy as np
@@ -50,7 +52,9 @@ def ruler_ticks(view: View, box: Rect) -> list[tuple[int, int | None]]:
 
 
 def paste_image(page: np.ndarray, box: Rect, image: np.ndarray) -> None:
-    """Draw an image, uint8 (rows, columns) or (rows, columns, 3), into its box, resampled unless it has the size of the box."""
+    """Draw an image, uint8 (rows, columns) or (rows, columns, 3), into its box, resampled unless it has
+    the size of the box.
+    """
     if image.shape[:2] != (box.height, box.width):
         resized = Image.fromarray(image).resize((box.width, box.height), Image.Resampling.BILINEAR)
         image = np.asarray(resized)
@@ -72,7 +76,9 @@ def draw_note(page: np.ndarray, layout: WindowLayout, box: Rect, note: str) -> N
 def draw_segments(
     page: np.ndarray, view: View, box: Rect, segments_mm: np.ndarray, colour, width: int = 1
 ) -> None:
-    """Draw line segments (n, 2, 2) of the plane [mm] over an image, so many pixels wide, clipped to its box."""
+    """Draw line segments (n, 2, 2) of the plane [mm] over an image, so many pixels wide, clipped to its
+    box.
+    """
     if len(segments_mm) == 0:
         return
     start, end = np.moveaxis(to_pixels(view, box, np.asarray(segments_mm, float)), 1, 0)
@@ -100,7 +106,9 @@ def draw_caliper(page: np.ndarray, layout: WindowLayout, view: View, box: Rect) 
 def beside(
     start: np.ndarray, end: np.ndarray, size: tuple[int, int], box: Rect, gap: int
 ) -> tuple[float, float]:
-    """Return the centre of a text of a size [pixels] beside a line, ``gap`` away, on the side towards the centre of the box."""
+    """Return the centre of a text of a size [pixels] beside a line, ``gap`` away, on the side towards the
+    centre of the box.
+    """
     along = (end - start) / max(float(np.linalg.norm(end - start)), 1.0)
     across = np.array([along[1], -along[0]]) if along.any() else np.array([1.0, 0.0])
     away = across * (gap + np.abs(across) @ size / 2)

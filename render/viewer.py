@@ -15,7 +15,8 @@ Technique = Literal["enucleation", "enucleoresection", "wedge"]
 TECHNIQUES: tuple[Technique, ...] = get_args(Technique)
 
 B_MODE, TGC, DOPPLER, RESECTION = "B-mode", "TGC", "Doppler", "Resection"
-# Groups of settings beside the image, as on a scanner: TGC or Doppler, and those of a resection, where the user asks for them.
+# Groups of settings beside the image, as on a scanner: TGC or Doppler, and those of a resection, where the
+# user asks for them.
 SCANNER_GROUPS = (B_MODE, TGC, DOPPLER, RESECTION)
 
 
@@ -32,8 +33,8 @@ def _level(number: int):
     return _slider(50, f"{number}", "", 0, 100, TGC)
 
 
-# The metadata of a setting (label, unit, low, high, group) is all that its slider is made of. One that is None or has no metadata has
-# no slider.
+# The metadata of a setting (label, unit, low, high, group) is all that its slider is made of. One that is
+# None or has no metadata has no slider.
 @dataclass
 class TissueSettings:
     """Settings of tissue and solver; each tissue model has one of the first two."""
@@ -113,10 +114,14 @@ class ResectionSettings:
 
 @dataclass
 class Settings(ResectionSettings, PlanSettings, ViewSettings, ScannerSettings, TissueSettings):
-    """What the user sets; each part of the program is handed its own part. A session records them by their names."""
+    """What the user sets; each part of the program is handed its own part.
+
+    A session records them by their names.
+    """
 
 
-# Vertices [mm], a Taichi field (n,) where they move and an array (n, 3) where they do not, and triangles, normals outward, int32 (m, 3).
+# Vertices [mm], a Taichi field (n,) where they move and an array (n, 3) where they do not, and triangles,
+# normals outward, int32 (m, 3).
 Surface = tuple[Any, np.ndarray]
 
 
@@ -130,7 +135,10 @@ class Geometry:
     up: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     """Direction opposite to gravity, shape (3,)."""
     transducer_size_mm: np.ndarray = field(default_factory=lambda: np.array([40.0, 10.0, 20.0]))
-    """The cuboid, shape (3,): x lateral and to the marked side, y elevation, z axis. The image leaves at z = -size/2."""
+    """The cuboid, shape (3,): x lateral and to the marked side, y elevation, z axis.
+
+    The image leaves at z = -size/2.
+    """
     transducer_radius_mm: float = 0.0
     """Radius of a curved array face, in the x-z plane; 0 where it is flat."""
     frequency_range_mhz: tuple[float, float] = (2.0, 15.0)
@@ -179,7 +187,10 @@ class View:
     transducer_pose: np.ndarray
     """World from transducer [mm], shape (4, 4)."""
     images: dict[str, np.ndarray]
-    """Name -> grey values, uint8, shape (rows = depth, columns = lateral, local x to the right). The 3D view shows the first."""
+    """Name -> grey values, uint8, shape (rows = depth, columns = lateral, local x to the right).
+
+    The 3D view shows the first.
+    """
     width_mm: float
     depth_mm: float
     doppler: np.ndarray | None = None
@@ -191,17 +202,23 @@ class View:
     above_mm: float = 0.0
     """Part of the depth behind the centre of the array face."""
     sector: tuple[float, float, float] | None = None
-    """Radius of the array face [mm] and angles of the first and last scanline [rad]; None for parallel scanlines."""
+    """Radius of the array face [mm] and angles of the first and last scanline [rad]; None for parallel
+    scanlines.
+    """
     focus_mm: float | None = None
     outline_mm: np.ndarray | None = None
-    """Outline of the tumour: segments on the plane, shape (n, 2, 2) [mm], x from the centre to the right, y down from the face."""
+    """Outline of the tumour: segments on the plane, shape (n, 2, 2) [mm], x from the centre to the right,
+    y down from the face.
+    """
     outline_before_mm: np.ndarray | None = None
     """The same at rest, in the CT."""
     resection_mm: np.ndarray | None = None
     """The same of the resection surface that a cut would have now."""
     score: Score | None = None
     seen: dict[str, np.ndarray] = field(default_factory=dict)
-    """Coverage: whether the tissue at each vertex of "organ" and "tumour" has been imaged, bool, shape (n,)."""
+    """Coverage: whether the tissue at each vertex of "organ" and "tumour" has been imaged, bool, shape
+    (n,).
+    """
     guidance: Guidance | None = None
     caliper_mm: tuple[tuple[float, float], ...] = ()
     """Up to two points on the plane [mm]."""
@@ -218,7 +235,9 @@ class View:
     alert: str = ""
     """Name of the finding that exceeds its limit."""
     status: str = ""
-    """Short status texts over the image, such as FROZEN, three spaces apart, by falling priority: the last are left out first."""
+    """Short status texts over the image, such as FROZEN, three spaces apart, by falling priority: the last
+    are left out first.
+    """
     clock: str = ""
     """The session's time, in simulated seconds: "42.6 s"."""
     pace: str = ""
@@ -245,7 +264,9 @@ class Controls:
 
     settings: Settings
     ray: tuple[np.ndarray, np.ndarray] | None = None
-    """Origin [mm] and unit direction under the mouse, world, each (3,); None off the 3D view or while the view turns."""
+    """Origin [mm] and unit direction under the mouse, world, each (3,); None off the 3D view or while the
+    view turns.
+    """
     press: bool = False
     """The press button is held."""
     press_share: float = 1.0

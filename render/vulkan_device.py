@@ -6,7 +6,8 @@ from functools import cache
 from typing import NamedTuple
 
 LOADERS = {"win32": "vulkan-1.dll", "darwin": "libvulkan.1.dylib"}
-# Of VkInstanceCreateInfo: its type, and its size in 64-bit words; of VkPhysicalDeviceProperties: its size, and where type and name are.
+# Of VkInstanceCreateInfo: its type, and its size in 64-bit words; of VkPhysicalDeviceProperties: its size,
+# and where type and name are.
 INSTANCE_INFO, INFO_WORDS = 1, 8
 PROPERTIES_BYTES, TYPE_AT, NAME_AT, NAME_BYTES = 1024, 16, 20, 256
 PROCESSOR = 4

@@ -1,9 +1,10 @@
 """The window, on a screen or off-screen: 3D view, ultrasound panel, sliders, mouse and keys.
 
 The only file that uses ti.ui. A frame is drawn in this order:
-1. a full-window background image (background_image.py): panel, images, texts; where no graphics card draws, the 3D view too
-   (software_scene.py);
-2. elsewhere, invisible quads near the camera, over the panel and the strip, which fill the depth buffer there, so that no organ covers them;
+1. a full-window background image (background_image.py): panel, images, texts; where no graphics card draws,
+   the 3D view too (software_scene.py);
+2. elsewhere, invisible quads near the camera, over the panel and the strip, which fill the depth buffer
+   there, so that no organ covers them;
 3. support, transducer, image plane, tumour, and last the organ, whose faces may be translucent;
 4. the sliders, from the metadata of `Settings`.
 """
@@ -35,7 +36,8 @@ from sim.device import on_cpu
 from sim.taichi_internals import set_image
 
 ZOOM_S = 0.5
-# How far beside a box of sliders the mouse still takes its edge [pixels], and how far it goes in a drag, in shares of the window.
+# How far beside a box of sliders the mouse still takes its edge [pixels], and how far it goes in a drag, in
+# shares of the window.
 BOX_EDGE_PX, DRAG = 4, 0.002
 ZOOM_SENSE = {"zoom_in": -1.0, "zoom_out": 1.0}
 FRAMES_A_SECOND = 60
@@ -59,7 +61,8 @@ class Window:
         visible: a real window, at most FRAMES_A_SECOND; else off-screen, drawn only by `picture`.
         keys: assignment of keys.
         gamepad: read beside mouse and keys, if given.
-        by_processor: the 3D view is drawn by our own kernels on the processor; None where no graphics card draws.
+        by_processor: the 3D view is drawn by our own kernels on the processor; None where no graphics card
+        draws.
 
     Raises:
         NoVulkan: no Vulkan loader, driver or device.
@@ -135,7 +138,9 @@ class Window:
         self._seen = ()
 
     def prepare(self, view: View) -> None:
-        """Where the processor draws the 3D view, draw it once without showing it, so that the first `draw` need not wait for its kernels."""
+        """Where the processor draws the 3D view, draw it once without showing it, so that the first `draw`
+        need not wait for its kernels.
+        """
         if self._software is not None:
             self._render(self._software, view, self._background.pixels.copy())
 
@@ -208,13 +213,15 @@ class Window:
         return cursor[0] * self.layout.width, (1 - cursor[1]) * self.layout.height
 
     def _read_events(self, controls: Controls) -> None:
-        # In a slow frame shift may be released before the frame reads its keys: it counts if it was held before, or pressed before the key.
+        # In a slow frame shift may be released before the frame reads its keys: it counts if it was held
+        # before, or pressed before the key.
         with_shift, self._held_shift = self._held_shift, self._window.is_pressed(ti.ui.SHIFT)
         for event in self._window.get_events(ti.ui.PRESS):
             with_shift = with_shift or event.key == ti.ui.SHIFT
             self._key_down(event.key, with_shift, controls)
         for event in self._window.get_events(ti.ui.RELEASE):
-            # GGUI tells presses and releases of a slow frame apart, but not their order: what is held now was pressed last.
+            # GGUI tells presses and releases of a slow frame apart, but not their order: what is held now was
+            # pressed last.
             if self._window.is_pressed(event.key):
                 continue
             if event.key == ti.ui.LMB:
@@ -259,7 +266,9 @@ class Window:
         return box.height, box.width
 
     def draw_scene(self, view: View, may_wait: bool) -> None:
-        """Where the processor draws the 3D view, draw it already, for the next `draw`; with `may_wait` only if the user changed it."""
+        """Where the processor draws the 3D view, draw it already, for the next `draw`; with `may_wait`
+        only if the user changed it.
+        """
         if self._software is not None and not self._help_shown and self._background.has_scene:
             self._is_ahead = True
             if not self._keeps_scene(may_wait):
@@ -274,11 +283,15 @@ class Window:
             self._update_size()
 
     def picture(self) -> np.ndarray:
-        """Return the last view drawn, uint8, shape (height, width, 3). Raises RuntimeError if nothing was drawn."""
+        """Return the last view drawn, uint8, shape (height, width, 3).
+
+        Raises RuntimeError if nothing was drawn.
+        """
         if self._view is None:
             raise RuntimeError("nothing was drawn yet")
         self._place_sliders()
-        # Dear ImGui shows a new box one frame late, and in the first frames of some drivers a body may be missing.
+        # Dear ImGui shows a new box one frame late, and in the first frames of some drivers a body may be
+        # missing.
         while not self._visible and self._warm_up > 0:
             self._warm_up -= 1
             self._draw_frame(self._view)
@@ -357,8 +370,8 @@ class Window:
         software.render(self.layout.scene, pixels)
 
     def _keeps_scene(self, may_wait: bool = False) -> bool:
-        """Whether the 3D view may stay as it is in this frame: for SCENE_S where frames are slow, or where it may wait, unless the user
-        changes the view.
+        """Whether the 3D view may stay as it is in this frame: for SCENE_S where frames are slow, or where it
+        may wait, unless the user changes the view.
         """
         now, seen = time.perf_counter(), (*self.camera.state, dataclasses.astuple(self.settings))
         is_slow, self._frame_at = now - self._frame_at > SLOW_FRAME_S, now

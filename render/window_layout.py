@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-# B-mode and CT of the drop-in probe, 16 x 40 mm each, nearly fill a panel of this fraction of 1280 x 720 pixels.
+# B-mode and CT of the drop-in probe, 16 x 40 mm each, nearly fill a panel of this fraction of 1280 x 720
+# pixels.
 PANEL_SHARE = 0.43
 TITLE_HEIGHT, CLOCK_WIDTH = 42, 150
 STRIP_HEIGHT, STRIP_GAP, READOUT_WIDTH = 184, 4, 134
@@ -129,7 +130,9 @@ class WindowLayout:
 
     @property
     def foot(self) -> Rect:
-        """The line at the foot of the 3D view, beside the compass, from which a box of warnings grows upwards."""
+        """The line at the foot of the 3D view, beside the compass, from which a box of warnings grows
+        upwards.
+        """
         left, gap = self.compass.right + self.px(FINDINGS_GAP), self.px(FINDINGS_GAP)
         return Rect(left, self.scene.bottom - gap, self.scene.right - gap - left, 0)
 
@@ -168,8 +171,8 @@ class WindowLayout:
         return self.readouts.left - self.px(STRIP_GAP) * (count + 1)
 
     def scanner_sliders(self, sizes: list[tuple[int, int]]) -> list[Rect]:
-        """Return boxes of these widths and heights beside the panel: one under the other, and where there is no more room, in a further
-        column.
+        """Return boxes of these widths and heights beside the panel: one under the other, and where there is
+        no more room, in a further column.
         """
         gap = self.px(SCANNER_GAP)
         right, first, room = self.scene.right - gap, self.scene.top + gap, self.scene.height - 2 * gap
@@ -187,7 +190,8 @@ class WindowLayout:
         return Rect(0, 0, self.width, self.height)
 
     def image_boxes(self, count: int, width_mm: float, depth_mm: float) -> list[Rect]:
-        """Return the largest boxes in the panel with the shape of the image plane, side by side or one under the other.
+        """Return the largest boxes in the panel with the shape of the image plane, side by side or one under
+        the other.
 
         Raises ValueError unless both lengths are positive.
         """
@@ -211,7 +215,9 @@ class WindowLayout:
         ]
 
     def window_coordinates(self, rect: Rect) -> tuple[float, float, float, float]:
-        """Return left, bottom, right, top with (0, 0) at the bottom left and (1, 1) at the top right of the window."""
+        """Return left, bottom, right, top with (0, 0) at the bottom left and (1, 1) at the top right of
+        the window.
+        """
         return (
             rect.left / self.width,
             1 - rect.bottom / self.height,

@@ -16,7 +16,8 @@ from scenes.terminal import shell_command
 def acknowledge_command(patient: Path, yes: bool) -> None:
     """Mark the warnings of PATIENT's import as checked.
 
-    PATIENT is the folder that import made. Its warnings are then no longer shown in the window; terminal and reports still name them.
+    PATIENT is the folder that import made. Its warnings are then no longer shown in the window; terminal and
+    reports still name them.
     """
     folder = scene_file(patient).parent
     findings = read_findings(folder)

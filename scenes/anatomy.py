@@ -97,8 +97,8 @@ def fingerprint(anatomy: LoadedAnatomy) -> str:
 def press_on(press: Press, anatomy: LoadedAnatomy, gravity: np.ndarray) -> Press:
     """The press with defaults for what the scene leaves out.
 
-    The direction is gravity's, through the centre of mass of the tumour, or else of the organ; the image plane contains the
-    organ's long axis.
+    The direction is gravity's, through the centre of mass of the tumour, or else of the organ; the image
+    plane contains the organ's long axis.
     """
     direction = np.array(press.direction or gravity, float)
     middle = (anatomy.tumour or anatomy.organ).center_mass

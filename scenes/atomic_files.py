@@ -1,4 +1,6 @@
-"""Atomic writes: a file or folder appears complete, or not at all; and names of files for libraries that crash on some."""
+"""Atomic writes: a file or folder appears complete, or not at all; and names of files for libraries that
+crash on some.
+"""
 
 import glob
 import os
@@ -17,13 +19,15 @@ from errors import PatientError
 
 # The process that writes a temporary file or folder, in its name.
 WRITER = re.compile(r"\.(\d+)-[0-9a-f]+\.partial-")
-# Letters of a name that a temporary name repeats whole: with the writer they stay below what file systems allow.
+# Letters of a name that a temporary name repeats whole: with the writer they stay below what file systems
+# allow.
 SHORT = 24
 
 
 @contextmanager
 def plain_path(path: Path, *beside: Path) -> Iterator[str]:
-    """A file's name for a library that ends the process where one is not UTF-8: the same, or that of a link to it.
+    """A file's name for a library that ends the process where one is not UTF-8: the same, or that of a link
+    to it.
 
     ``beside``: other files that the file names. A file that is written need not exist. Raises OSError.
     """
@@ -41,16 +45,21 @@ def plain_path(path: Path, *beside: Path) -> Iterator[str]:
 
 
 def check_writable(folder: Path) -> None:
-    """Write a file into a folder and remove it: permissions alone do not show a full or read-only disk. Raises OSError."""
+    """Write a file into a folder and remove it: permissions alone do not show a full or read-only disk.
+
+    Raises OSError.
+    """
     with tempfile.TemporaryFile(dir=folder, buffering=0) as file:
         file.write(b"0")
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Yield a temporary path for a file or folder; without an error it is renamed to ``path``, else it is removed.
+    """Yield a temporary path for a file or folder; without an error it is renamed to ``path``, else it is
+    removed.
 
-    The caller creates a folder itself; ``path`` must not exist, or be an empty folder. Raises OSError, which names the path.
+    The caller creates a folder itself; ``path`` must not exist, or be an empty folder. Raises OSError, which
+    names the path.
     """
     partial = path.with_name(f".{os.getpid()}-{secrets.token_hex(4)}.partial-{_short(path.name)}")
     try:
@@ -68,13 +77,18 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def _short(name: str) -> str:
-    """A name, or a checksum and the end of a long one: the suffix, by which libraries choose a format, stays."""
+    """A name, or a checksum and the end of a long one: the suffix, by which libraries choose a format,
+    stays.
+    """
     return name if len(name) <= SHORT else f"{zlib.crc32(os.fsencode(name)):08x}{name[8 - SHORT :]}"
 
 
 @contextmanager
 def new_folder(folder: Path) -> Iterator[Path]:
-    """Yield an empty folder to write to; it becomes ``folder`` when all files are written. Raises PatientError."""
+    """Yield an empty folder to write to; it becomes ``folder`` when all files are written.
+
+    Raises PatientError.
+    """
     check_folder(folder)
     for left in folder.parent.glob(f".*.partial-{glob.escape(_short(folder.name))}"):
         if not _is_being_written(left):
@@ -96,7 +110,10 @@ def _is_being_written(partial: Path) -> bool:
 
 
 def check_folder(folder: Path) -> None:
-    """Check that a folder of this name can be created and written to, before the work. Raises PatientError."""
+    """Check that a folder of this name can be created and written to, before the work.
+
+    Raises PatientError.
+    """
     # Path.exists raises where a name is too long.
     if os.path.exists(folder) and (not folder.is_dir() or any(folder.iterdir())):
         raise PatientError(f"{folder}: exists and is not an empty folder; choose another folder or remove it")

@@ -29,7 +29,9 @@ def entries_of(folder: Path) -> list[Path]:
 
 
 def files_below(folder: Path, unreadable: Callable[[OSError], object] | None = None) -> Iterator[Path]:
-    """The files of a folder and its subfolders, by folder and name; ``unreadable`` is called for each that cannot be listed."""
+    """The files of a folder and its subfolders, by folder and name; ``unreadable`` is called for each that
+    cannot be listed.
+    """
     for root, folders, names in os.walk(folder, onerror=unreadable):
         folders[:] = sorted(name for name in folders if not is_system_file(Path(name)))
         for name in sorted(names):

@@ -1,4 +1,7 @@
-"""The findings of an import: ``import.json`` in a patient's folder. Its warnings are shown until the user acknowledges them."""
+"""The findings of an import: ``import.json`` in a patient's folder.
+
+Its warnings are shown until the user acknowledges them.
+"""
 
 from collections.abc import Collection
 from pathlib import Path
@@ -88,7 +91,10 @@ def findings_text(findings: ImportFindings) -> str:
 
 
 def read_findings(folder: Path) -> ImportFindings | None:
-    """The findings in a patient's folder; None where there are none, as before version 2. Raises SceneError."""
+    """The findings in a patient's folder; None where there are none, as before version 2.
+
+    Raises SceneError.
+    """
     path = folder / FINDINGS_FILE
     try:
         return ImportFindings.model_validate_json(read_text(path))
@@ -98,7 +104,8 @@ def read_findings(folder: Path) -> ImportFindings | None:
         raise SceneError(f"{path}: cannot be read ({error}); check that it can be read") from None
     except ValidationError as error:
         raise SceneError(
-            f"{path}: {explained(error)}; expected the findings of app.py import; import the patient again, or remove this file and its "
+            f"{path}: {explained(error)}; expected the findings of app.py import; import the patient again, "
+            "or remove this file and its "
             "warnings"
         ) from None
 
@@ -110,7 +117,10 @@ def open_warnings(scene: Scene, folder: Path) -> tuple[str, ...]:
 
 
 def acknowledged_warnings(scene: Scene, folder: Path) -> tuple[str, ...]:
-    """The warnings of a scene's import that the user has acknowledged: they are still true of its images. Raises SceneError."""
+    """The warnings of a scene's import that the user has acknowledged: they are still true of its images.
+
+    Raises SceneError.
+    """
     findings = _findings_of(scene, folder)
     return () if findings is None else findings.acknowledged_warnings
 
@@ -120,7 +130,8 @@ def _findings_of(scene: Scene, folder: Path) -> ImportFindings | None:
 
 
 def acknowledge(folder: Path, shown: Collection[str]) -> None:
-    """Mark the warnings of a patient's folder that were shown as acknowledged: since then the patient may have been imported again.
+    """Mark the warnings of a patient's folder that were shown as acknowledged: since then the patient may
+    have been imported again.
 
     Raises SceneError, OSError.
     """

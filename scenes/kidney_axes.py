@@ -1,8 +1,10 @@
-"""The axes of a kidney for nephrometry: contour without lesions, polar axis, hilum, polar lines and sinus lines.
+"""The axes of a kidney for nephrometry: contour without lesions, polar axis, hilum, polar lines and sinus
+lines.
 
-Polar lines: between them, the medial lip of the parenchyma is interrupted by renal sinus, vessels or collecting system
-(Kutikov & Uzzo 2009, J Urol 182, 844). Sinus lines: the upper and lower end of the renal sinus (Ficarra et al. 2009, Eur Urol 56,
-786). Both papers read them from axial and coronal images. Here they are planes across the polar axis.
+Polar lines: between them, the medial lip of the parenchyma is interrupted by renal sinus, vessels or
+collecting system (Kutikov & Uzzo 2009, J Urol 182, 844). Sinus lines: the upper and lower end of the renal
+sinus (Ficarra et al. 2009, Eur Urol 56, 786). Both papers read them from axial and coronal images. Here they
+are planes across the polar axis.
 """
 
 from collections.abc import Sequence
@@ -18,9 +20,11 @@ from scenes.surfaces import signed_distance_from
 
 # Vertices of the organ this near to a lesion are the lesion's own surface.
 LESION_MM = 2.0
-# Tissue this deep under the organ's surface decides whether the surface is parenchyma or opens into the sinus.
+# Tissue this deep under the organ's surface decides whether the surface is parenchyma or opens into the
+# sinus.
 UNDER_SURFACE_MM = 1.0
-# The hilar concavity is where the contour is farther from the organ than this share of the greatest distance. Without a distance of
+# The hilar concavity is where the contour is farther from the organ than this share of the greatest distance.
+# Without a distance of
 # LEAST_CONCAVITY_MM near the hilum there is none. The contour is sampled every MOUTH_MM.
 CONCAVITY_SHARE, LEAST_CONCAVITY_MM = 0.5, 2.0
 NEAR_HILUM_MM, MOUTH_MM = 30.0, 3.0
@@ -29,7 +33,9 @@ OPENING = ("sinus", "urine", "vessel")
 
 @dataclass(frozen=True)
 class KidneyAxes:
-    """Directions (3,) are unit vectors in LPS; heights [mm] are along ``polar`` from ``centre``, to the head positive."""
+    """Directions (3,) are unit vectors in LPS; heights [mm] are along ``polar`` from ``centre``, to the
+    head positive.
+    """
 
     contour: trimesh.Trimesh
     """Convex hull [mm] of the organ's surface without its lesions: the kidney's contour before the tumour."""
@@ -71,8 +77,8 @@ def kidney_axes(
 ) -> KidneyAxes:
     """The axes of a kidney.
 
-    The polar axis is the axis of least inertia of the contour. The hilum is the surface that opens into the labelled sinus, or else
-    the mouth of the concavity near ``hilum_mm``.
+    The polar axis is the axis of least inertia of the contour. The hilum is the surface that opens into the
+    labelled sinus, or else the mouth of the concavity near ``hilum_mm``.
 
     Args:
         organ: surface [mm, LPS] with its tumours and cysts.
@@ -101,7 +107,9 @@ def kidney_axes(
 
 
 def _off_lesions(organ: trimesh.Trimesh, lesions: Sequence[trimesh.Trimesh]) -> np.ndarray:
-    """Which vertices (n,) of an organ are not the surface of a lesion; all, where the organ is nothing but lesions."""
+    """Which vertices (n,) of an organ are not the surface of a lesion; all, where the organ is nothing but
+    lesions.
+    """
     own = np.ones(len(organ.vertices), bool)
     for lesion in lesions:
         own &= signed_distance_from(lesion, organ.vertices) > LESION_MM
@@ -109,7 +117,9 @@ def _off_lesions(organ: trimesh.Trimesh, lesions: Sequence[trimesh.Trimesh]) -> 
 
 
 def _sinus_opening(organ: trimesh.Trimesh, parts: dict[str, trimesh.Trimesh], own: np.ndarray) -> np.ndarray:
-    """Vertices (n, 3) with sinus, collecting system or a vessel under them instead of parenchyma: the largest piece of such surface."""
+    """Vertices (n, 3) with sinus, collecting system or a vessel under them instead of parenchyma: the
+    largest piece of such surface.
+    """
     under = organ.vertices - UNDER_SURFACE_MM * organ.vertex_normals
     inside = [signed_distance_from(parts[tissue], under) < 0 for tissue in OPENING if tissue in parts]
     opens = own & np.any(inside, axis=0)
@@ -121,7 +131,9 @@ def _sinus_opening(organ: trimesh.Trimesh, parts: dict[str, trimesh.Trimesh], ow
 
 
 def _concavity(organ: trimesh.Trimesh, contour: trimesh.Trimesh, hilum_mm: np.ndarray) -> np.ndarray:
-    """Points (n, 3) of the contour over the hilar concavity: the mouth of the hilum between the lips of the parenchyma."""
+    """Points (n, 3) of the contour over the hilar concavity: the mouth of the hilum between the lips of
+    the parenchyma.
+    """
     fine = cast(trimesh.Trimesh, contour.subdivide_to_size(MOUTH_MM))
     gap = signed_distance_from(organ, fine.vertices)
     near = np.linalg.norm(fine.vertices - hilum_mm, axis=1) <= NEAR_HILUM_MM
@@ -147,7 +159,9 @@ def _ends(points: np.ndarray, centre: np.ndarray, polar: np.ndarray) -> tuple[fl
 
 
 def _across(hilum: np.ndarray, centre: np.ndarray, polar: np.ndarray) -> np.ndarray | None:
-    """Unit vector (3,) from the polar axis to the middle of the hilum's points (n, 3); None without points."""
+    """Unit vector (3,) from the polar axis to the middle of the hilum's points (n, 3); None without
+    points.
+    """
     if len(hilum) == 0:
         return None
     to_hilum = hilum.mean(axis=0) - centre

@@ -30,7 +30,9 @@ class PartProperties(Section):
 
 
 class MechanicalProperties(Section):
-    """Low, typical and high values: stiffness of capsule and pedicle [N/mm], of perirenal fat [kPa/mm], friction, and the parts' own."""
+    """Low, typical and high values: stiffness of capsule and pedicle [N/mm], of perirenal fat [kPa/mm],
+    friction, and the parts' own.
+    """
 
     capsule_n_mm: Range
     pedicle_n_mm: Range

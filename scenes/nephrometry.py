@@ -1,7 +1,8 @@
 """Nephrometry scores of a renal tumour: R.E.N.A.L. and PADUA, from its measured anatomy.
 
-R.E.N.A.L.: Kutikov & Uzzo 2009, J Urol 182, 844. PADUA: Ficarra et al. 2009, Eur Urol 56, 786. Both are read by eye from CT. Where
-the papers leave a measure open, the rules are close to the computer-generated scores of Heller et al. 2022 (J Urol 207, 1105).
+R.E.N.A.L.: Kutikov & Uzzo 2009, J Urol 182, 844. PADUA: Ficarra et al. 2009, Eur Urol 56, 786. Both are read
+by eye from CT. Where the papers leave a measure open, the rules are close to the computer-generated scores of
+Heller et al. 2022 (J Urol 207, 1105).
 """
 
 from dataclasses import dataclass
@@ -10,7 +11,8 @@ from scenes.tumour_anatomy import TumourAnatomy
 
 # A share of the volume below this is an error of the surfaces: the tumour is entirely endophytic.
 LEAST_EXOPHYTIC = 0.02
-# The tumour is anterior or posterior with this share of its volume in front of the kidney's plane or behind it; else x.
+# The tumour is anterior or posterior with this share of its volume in front of the kidney's plane or behind
+# it; else x.
 FACE_SHARE = 2 / 3
 # A tumour this near to sinus or collecting system involves it (Heller et al.).
 INVOLVED_MM = 2.0
@@ -70,10 +72,11 @@ class NephrometryScore:
 def renal_score(tumour: TumourAnatomy) -> NephrometryScore:
     """R.E.N.A.L. nephrometry score, 4 to 12 points: low to 6, moderate to 9, high from 10.
 
-    R: diameter, up to 40 mm 1, below 70 mm 2, else 3. E: exophytic share of the volume, from 50 % 1, below 2, entirely endophytic 3.
-    N: distance to collecting system or sinus, from 7 mm 1, above 4 mm 2, else 3. L: entirely above or below the polar lines 1, across
-    one 2; 3 with more than half of the volume between them, or across the midline between them. A: ``face_of``. Suffix h: the
-    tumour touches the main renal artery or vein.
+    R: diameter, up to 40 mm 1, below 70 mm 2, else 3. E: exophytic share of the volume, from 50 % 1, below 2,
+    entirely endophytic 3. N: distance to collecting system or sinus, from 7 mm 1, above 4 mm 2, else 3. L:
+    entirely above or below the polar lines 1, across one 2; 3 with more than half of the volume between them,
+    or across the midline between them. A: ``face_of``. Suffix h: the tumour touches the main renal artery or
+    vein.
     """
     radius = 1 if tumour.diameter_mm <= 40 else 2 if tumour.diameter_mm < 70 else 3
     return NephrometryScore(
@@ -91,9 +94,10 @@ def renal_score(tumour: TumourAnatomy) -> NephrometryScore:
 def padua_score(tumour: TumourAnatomy) -> NephrometryScore:
     """PADUA score, 6 to 14 points: low to 7, intermediate to 9, high from 10.
 
-    Location: more than half of the volume between the sinus lines 2, else 1. Exophytic rate: as E. Rim: centre of mass on the hilum's
-    side of the polar axis (medial) 2, else 1. Sinus and collecting system: involved 2, else 1; that a tumour only displaces the
-    collecting system is not measured. Size: diameter up to 40 mm 1, up to 70 mm 2, else 3.
+    Location: more than half of the volume between the sinus lines 2, else 1. Exophytic rate: as E. Rim:
+    centre of mass on the hilum's side of the polar axis (medial) 2, else 1. Sinus and collecting system:
+    involved 2, else 1; that a tumour only displaces the collecting system is not measured. Size: diameter up
+    to 40 mm 1, up to 70 mm 2, else 3.
     """
     size = 1 if tumour.diameter_mm <= 40 else 2 if tumour.diameter_mm <= 70 else 3
     face = face_of(tumour)
@@ -112,7 +116,9 @@ def padua_score(tumour: TumourAnatomy) -> NephrometryScore:
 
 
 def face_of(tumour: TumourAnatomy) -> str:
-    """a or p: FACE_SHARE of the volume is in front of, or behind, the plane through polar axis and hilum; x: neither; "": not known."""
+    """a or p: FACE_SHARE of the volume is in front of, or behind, the plane through polar axis and hilum;
+    x: neither; "": not known.
+    """
     if tumour.axes.anterior is None:
         return ""
     share = float(((tumour.points - tumour.axes.centre) @ tumour.axes.anterior > 0).mean())
@@ -125,7 +131,9 @@ def _exophytic_points(tumour: TumourAnatomy) -> int:
 
 
 def _nearness(tumour: TumourAnatomy) -> Component:
-    """The nearer of sinus and collecting system; one that is not labelled may be nearer still, with more points."""
+    """The nearer of sinus and collecting system; one that is not labelled may be nearer still, with more
+    points.
+    """
     known = {t: tumour.distance_mm[t] for t in ("urine", "sinus") if t in tumour.distance_mm}
     needs = tuple(name for t, name in NAMES.items() if t not in known)
     if not known:

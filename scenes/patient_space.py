@@ -1,10 +1,13 @@
-"""Coordinate systems of files in the patient, named by where their axes point: LPS, DICOM's, or RAS, NIfTI's."""
+"""Coordinate systems of files in the patient, named by where their axes point: LPS, DICOM's, or RAS,
+NIfTI's.
+"""
 
 from typing import Literal, get_args
 
 import numpy as np
 
-# Where +x, +y and +z point: to the patient's left or right, posterior or anterior, superior (to the head) or inferior.
+# Where +x, +y and +z point: to the patient's left or right, posterior or anterior, superior (to the head) or
+# inferior.
 Space = Literal["LPS", "LPI", "LAS", "LAI", "RPS", "RPI", "RAS", "RAI"]
 SPACES: tuple[Space, ...] = get_args(Space)
 WORDS = {"L": "left", "R": "right", "P": "back", "A": "front", "S": "head", "I": "feet"}

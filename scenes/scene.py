@@ -1,7 +1,7 @@
 """The scene file: one TOML file that states what is modelled and how; the unit is in the name of each key.
 
-Lengths are mm in patient coordinates (LPS), times s, angles degrees. ``load_scene`` refuses unknown keys, units
-other than the schema's, and values out of range, and names each.
+Lengths are mm in patient coordinates (LPS), times s, angles degrees. ``load_scene`` refuses unknown keys,
+units other than the schema's, and values out of range, and names each.
 """
 
 import re
@@ -54,9 +54,9 @@ LabelValue = Annotated[str, Field(pattern=r"^[1-9]\d*$")]
 class AnatomyFiles(Section):
     """The embedded patient, or files in the scene's folder; without a CT there is no image.
 
-    ``parts`` are further surfaces in the organ, by tissue. ``tissues`` maps each value of ``labels`` to a tissue of
-    ``ultrasound/acoustic_tissues.toml``; ``corrected_tissues`` those of ``corrections``, a volume on any grid, 0 where the tissue is as
-    labelled or classified.
+    ``parts`` are further surfaces in the organ, by tissue. ``tissues`` maps each value of ``labels`` to a
+    tissue of ``ultrasound/acoustic_tissues.toml``; ``corrected_tissues`` those of ``corrections``, a volume
+    on any grid, 0 where the tissue is as labelled or classified.
     """
 
     phantom: bool = False
@@ -79,7 +79,8 @@ class AnatomyFiles(Section):
 
 
 class SolverSection(Section):
-    """One time step. Values that are left out are the tissue model's defaults; those of shape matching are the paper's Table 1.
+    """One time step. Values that are left out are the tissue model's defaults; those of shape matching are
+    the paper's Table 1.
 
     ``relaxation`` (Eq. 7), ``stabilisation_iterations`` and ``mass_scaling_per_mm`` belong to shape matching.
     """
@@ -110,9 +111,9 @@ class Contact(Section):
 class Attachment(Section):
     """What holds the organ: its pedicle at the hilum, and perirenal fat.
 
-    The tissue within ``radius_mm`` of ``at_mm`` is tied to its place at rest by a tether of ``stiffness_n_mm`` in all; with 0 it is
-    fixed. A radius of 0: no pedicle. ``fat_kpa_mm`` is the stiffness of the fat around the organ, but for the side that faces the
-    transducer; 0: none.
+    The tissue within ``radius_mm`` of ``at_mm`` is tied to its place at rest by a tether of
+    ``stiffness_n_mm`` in all; with 0 it is fixed. A radius of 0: no pedicle. ``fat_kpa_mm`` is the stiffness
+    of the fat around the organ, but for the side that faces the transducer; 0: none.
     """
 
     at_mm: Vector3 | None = None
@@ -128,7 +129,8 @@ class Attachment(Section):
             )
         if self.stiffness_n_mm > 0 and self.radius_mm == 0:
             raise ValueError(
-                "attachment.stiffness_n_mm needs the tissue that it holds: give attachment.radius_mm, or leave both out"
+                "attachment.stiffness_n_mm needs the tissue that it holds: give attachment.radius_mm, or "
+                "leave both out"
             )
         return self
 
@@ -166,10 +168,11 @@ ProbeLength = Annotated[float, Field(gt=0, le=150)]
 
 
 class Transducer(Section):
-    """A probe: the name of one in ``ultrasound/probes``, or of a file in the scene's folder; it moves at ``speed_mm_s`` at most.
+    """A probe: the name of one in ``ultrasound/probes``, or of a file in the scene's folder; it moves at
+    ``speed_mm_s`` at most.
 
-    Its shape is a cuboid, lateral x elevation x length: the probe's housing, or ``size_mm``. The window warns where the tissue
-    under it is compressed by more than ``compression_warning_mm``.
+    Its shape is a cuboid, lateral x elevation x length: the probe's housing, or ``size_mm``. The window warns
+    where the tissue under it is compressed by more than ``compression_warning_mm``.
     """
 
     probe: str = "linear"
@@ -179,10 +182,11 @@ class Transducer(Section):
 
 
 class Trocar(Section):
-    """The instrument's port, a remote centre of motion: the shaft passes ``at_mm``, within a cone, and ends in a wrist.
+    """The instrument's port, a remote centre of motion: the shaft passes ``at_mm``, within a cone, and ends
+    in a wrist.
 
-    ``axis`` points into the body; its default is the direction to the target. ``wrist_deg`` is the largest angle between probe and
-    shaft: 0 for a rigid one. Without ``at_mm`` the instrument's path is not checked.
+    ``axis`` points into the body; its default is the direction to the target. ``wrist_deg`` is the largest
+    angle between probe and shaft: 0 for a rigid one. Without ``at_mm`` the instrument's path is not checked.
     """
 
     at_mm: Vector3 | None = None
@@ -193,13 +197,15 @@ class Trocar(Section):
 
 
 class Image(Section):
-    """The ultrasound panel: the kind of image, its detail level (``rung`` in scenes of version 1.0), and the CT window.
+    """The ultrasound panel: the kind of image, its detail level (``rung`` in scenes of version 1.0), and the
+    CT window.
 
-    The default depth is the probe's. An element is in contact where the organ is closer to the array than ``contact_gap_mm``; with
-    ``contact`` "tissue", where the CT shows anything but gas. ``outside`` "fluid": a layer of irrigation fluid of ``fluid_gap_mm``
-    covers the organ, through which elements are in contact too; in front of it is gas. Water stays on a surface up to a height of 1.4
-    times its capillary length, which is 2.7 mm. With ``atlas``, what the CT cannot show is drawn from an atlas: pyramids without
-    enhancement, the renal fascia, layers in muscle.
+    The default depth is the probe's. An element is in contact where the organ is closer to the array than
+    ``contact_gap_mm``; with ``contact`` "tissue", where the CT shows anything but gas. ``outside`` "fluid": a
+    layer of irrigation fluid of ``fluid_gap_mm`` covers the organ, through which elements are in contact too;
+    in front of it is gas. Water stays on a surface up to a height of 1.4 times its capillary length, which is
+    2.7 mm. With ``atlas``, what the CT cannot show is drawn from an atlas: pyramids without enhancement, the
+    renal fascia, layers in muscle.
     """
 
     mode: Literal["ct", "b-mode", "both"] = "both"
@@ -220,7 +226,8 @@ class Image(Section):
     def _fluid_is_on_the_organ(self) -> "Image":
         if self.outside == "fluid" and self.contact != "organ":
             raise ValueError(
-                f'image.outside = "fluid" couples the array to the organ, image.contact is "{self.contact}": set it to "organ", or leave it out'
+                f'image.outside = "fluid" couples the array to the organ, image.contact is "{self.contact}": '
+                'set it to "organ", or leave it out'
             )
         return self
 
@@ -233,9 +240,10 @@ class Image(Section):
 class Press(Section):
     """The scripted press, with the paper's warm-up and number of steps per stage.
 
-    After the warm-up, in which the organ settles on its support, the transducer's axis passes ``target_mm`` along
-    ``direction``, with the image's lateral axis along ``lateral``. It starts where it just touches the organ and presses
-    to each of ``indentations_mm``, by default within the default ``compression_warning_mm``.
+    After the warm-up, in which the organ settles on its support, the transducer's axis passes ``target_mm``
+    along ``direction``, with the image's lateral axis along ``lateral``. It starts where it just touches the
+    organ and presses to each of ``indentations_mm``, by default within the default
+    ``compression_warning_mm``.
     """
 
     target_mm: Vector3 | None = None
@@ -247,7 +255,11 @@ class Press(Section):
 
 
 class Scene(Section):
-    """A scene. ``nephron_scene`` is the format; scenes without it are read as those of this version. ``shape`` lists the rigid shapes: the support first. ``uncertainty`` is a file of ``study uncertainty``."""
+    """A scene.
+
+    ``nephron_scene`` is the format; scenes without it are read as those of this version. ``shape`` lists the
+    rigid shapes: the support first. ``uncertainty`` is a file of ``study uncertainty``.
+    """
 
     nephron_scene: int = FORMAT
     title: str = ""
@@ -299,7 +311,8 @@ class Scene(Section):
         return self
 
 
-# Files that are given by mistake instead of a scene, by the end of their names, and the commands that read them.
+# Files that are given by mistake instead of a scene, by the end of their names, and the commands that read
+# them.
 NOT_SCENES: dict[str | tuple[str, ...], str] = {
     (".igs.mha", ".igs.nrrd"): "a tracked sweep: give it to app.py reconstruct or rehearse --track",
     (
@@ -327,14 +340,18 @@ def scene_file(named: Path) -> Path:
     if not path.is_file():
         if session := next(named.glob("session-*.jsonl"), None):
             raise SceneError(
-                f"{named}: contains {session.name}, a session: give that file to rehearse --replay; {EXPECTED}"
+                f"{named}: contains {session.name}, a session: give that file to rehearse --replay; "
+                f"{EXPECTED}"
             )
         raise SceneError(f"{named}: has no scene.toml; make a patient's folder from a CT with: app.py import")
     return path
 
 
 def load_scene(path: Path) -> Scene:
-    """Read a scene file; a probe's file gets its absolute path. Raises SceneError that names the file, the key and the remedy."""
+    """Read a scene file; a probe's file gets its absolute path.
+
+    Raises SceneError that names the file, the key and the remedy.
+    """
     for ends, what in NOT_SCENES.items():
         if path.name.lower().endswith(ends) and path.is_file():
             raise SceneError(f"{path}: is {what}; {EXPECTED}")
@@ -359,10 +376,10 @@ def load_scene(path: Path) -> Scene:
 def with_options(scene: Scene, options: Mapping[str, float | int | str | None]) -> Scene:
     """The scene with single values changed, such as ``{"tissue.radius_mm": 3.0}``; None leaves what is there.
 
-    A value that only another tissue model has selects that model, which starts from its own defaults, and without an attachment where
-    it has none. A probe's file is named
-    from where the program was started, not from beside the scene. Raises SceneError for a value out of range, and for values of
-    two models.
+    A value that only another tissue model has selects that model, which starts from its own defaults, and
+    without an attachment where it has none. A probe's file is named
+    from where the program was started, not from beside the scene. Raises SceneError for a value out of range,
+    and for values of two models.
     """
     values = scene.model_dump(exclude_unset=True)
     asked = [name.removeprefix("tissue.") for name, value in options.items() if value is not None]
@@ -409,7 +426,10 @@ def _unknown(where: list[str]) -> str:
     if sections == ["tissue"] and owners:
         return f"belongs to the tissue model {owners[0]}; choose it with tissue.model, or leave this out"
     if where == ["image", "width_mm"]:
-        return "unknown key; the picture is as wide as the probe's array (TransducerWidthMm in its file): leave this out"
+        return (
+            "unknown key; the picture is as wide as the probe's array (TransducerWidthMm in its file): "
+            "leave this out"
+        )
     kinds: Iterable[Any] = [Scene]
     if sections:
         kinds = {"tissue": TISSUES.values(), "shape": (PlaneShape, MeshShape, DistanceShape)}.get(

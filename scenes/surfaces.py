@@ -1,4 +1,6 @@
-"""Closed surfaces in LPS [mm]: read and written as files, translated; the volume inside one, and distances from it."""
+"""Closed surfaces in LPS [mm]: read and written as files, translated; the volume inside one, and distances
+from it.
+"""
 
 import re
 from pathlib import Path
@@ -38,7 +40,8 @@ def load_surface(path: Path) -> trimesh.Trimesh:
     surface = read_triangles(path)
     if not surface.is_watertight or surface.volume <= 0:
         raise PatientError(
-            f"{path}: is not a closed surface that faces outward, or is incomplete; copy it again, or repair it, for example in 3D Slicer"
+            f"{path}: is not a closed surface that faces outward, or is incomplete; copy it again, or repair "
+            "it, for example in 3D Slicer"
         )
     return surface
 
@@ -59,11 +62,13 @@ def read_triangles(path: Path) -> trimesh.Trimesh:
         raise
     except Exception:  # a damaged file is taken for other kinds, whose readers raise many kinds of error
         raise PatientError(
-            f"{path}: is incomplete or damaged, or of another kind than its name ends in; expected {EXPECTED}; copy or export it again"
+            f"{path}: is incomplete or damaged, or of another kind than its name ends in; expected "
+            f"{EXPECTED}; copy or export it again"
         ) from None
     if not isinstance(surface, trimesh.Trimesh) or len(surface.faces) == 0:
         raise PatientError(
-            f"{path}: has no triangles: it is incomplete or damaged, or no surface; expected {EXPECTED}; copy or export it again"
+            f"{path}: has no triangles: it is incomplete or damaged, or no surface; expected {EXPECTED}; "
+            "copy or export it again"
         )
     if not np.isfinite(surface.vertices).all():
         raise PatientError(
@@ -76,7 +81,9 @@ def read_triangles(path: Path) -> trimesh.Trimesh:
 
 
 def file_comments(path: Path) -> list[str]:
-    """The texts in a surface file that are no geometry: the header of an STL, the comments of a PLY or OBJ."""
+    """The texts in a surface file that are no geometry: the header of an STL, the comments of a PLY or
+    OBJ.
+    """
     with path.open("rb") as file:
         start = file.read(MOST_COMMENT_BYTES)
     kind = path.suffix.lower()
@@ -92,11 +99,15 @@ def file_comments(path: Path) -> list[str]:
 
 
 def stated_space(path: Path) -> Space | None:
-    """The coordinate system that a surface file states as 3D Slicer does, or None. Raises PatientError: two, or another."""
+    """The coordinate system that a surface file states as 3D Slicer does, or None.
+
+    Raises PatientError: two, or another.
+    """
     found = {name for text in file_comments(path) for name in SPACE_FIELD.findall(text)}
     if len(found) > 1 or not found <= {"LPS", "RAS"}:
         raise PatientError(
-            f"{path}: states SPACE={' and SPACE='.join(sorted(found))}; expected LPS or RAS; export it again from 3D Slicer"
+            f"{path}: states SPACE={' and SPACE='.join(sorted(found))}; expected LPS or RAS; export it again "
+            "from 3D Slicer"
         )
     return cast(Space, found.pop()) if found else None
 
@@ -172,9 +183,11 @@ def distances_on_grid(
     spacing_mm: float,
     exact_mm: tuple[float, float] = (-8.0, 8.0),
 ) -> np.ndarray:
-    """Distances [mm] (nx, ny, nz) of a grid's points from a closed surface, negative inside; ``low`` (3,) [mm] is the first point.
+    """Distances [mm] (nx, ny, nz) of a grid's points from a closed surface, negative inside; ``low`` (3,)
+    [mm] is the first point.
 
-    Exact from the first to the second of ``exact_mm``, elsewhere linear between every second point along each axis.
+    Exact from the first to the second of ``exact_mm``, elsewhere linear between every second point along each
+    axis.
     """
     few = -(-(np.array(counts) - 1) // COARSENESS) + 1
     coarse = signed_distance_from(surface, _grid_points(low, few, COARSENESS * spacing_mm)).reshape(few)

@@ -16,11 +16,13 @@ USUAL = "neo-hookean"
 
 
 class TissueSection(Section):
-    """The section ``[tissue]`` of a scene file. Each subclass is a tissue model that a scene can name; ``TISSUES`` lists them.
+    """The section ``[tissue]`` of a scene file. Each subclass is a tissue model that a scene can name;
+    ``TISSUES`` lists them.
 
-    ``size_key`` is the key of the resolution, ``piece_name`` what has that size, among the model's counts. ``report_line`` has names of
-    keys and counts. ``step_defaults`` are the model's own defaults of the solver's section, where these are not the paper's;
-    ``presets`` has what each quality changes of keys and step, from coarse to fine.
+    ``size_key`` is the key of the resolution, ``piece_name`` what has that size, among the model's counts.
+    ``report_line`` has names of keys and counts. ``step_defaults`` are the model's own defaults of the
+    solver's section, where these are not the paper's; ``presets`` has what each quality changes of keys and
+    step, from coarse to fine.
     """
 
     size_key: ClassVar[str]
@@ -44,7 +46,9 @@ class TissueSection(Section):
 
 
 class PartMaterial(Section):
-    """The material of a part of the organ; what is left out is typical of it (``mechanical_tissues.toml``)."""
+    """The material of a part of the organ; what is left out is typical of it
+    (``mechanical_tissues.toml``).
+    """
 
     young_kpa: float | None = Field(None, gt=0, le=1e6)
     poisson: float | None = Field(None, ge=0, le=0.4999)
@@ -59,11 +63,12 @@ class Prony(Section):
 
 
 class NeoHookeanTissue(TissueSection):
-    """Tissue true to a material, on cubic cells. Smaller cells are truer and slower; the material stays the same.
+    """Tissue true to a material, on cubic cells. Smaller cells are truer and slower; the material stays the
+    same.
 
-    ``parts`` have their own materials, ``young_kpa`` to ``density_g_cm3`` are those of the parenchyma. ``capsule_n_mm`` is the
-    stiffness of the capsule, modulus times thickness; 0: none. ``prony``: the terms of its relaxation.
-    The presets are points of the front that ``study trade`` measures.
+    ``parts`` have their own materials, ``young_kpa`` to ``density_g_cm3`` are those of the parenchyma.
+    ``capsule_n_mm`` is the stiffness of the capsule, modulus times thickness; 0: none. ``prony``: the terms
+    of its relaxation. The presets are points of the front that ``study trade`` measures.
     """
 
     size_key, piece_name = "cell_mm", "cells"
@@ -87,17 +92,20 @@ class NeoHookeanTissue(TissueSection):
 
 
 class ShapeMatchingTissue(TissueSection):
-    """The paper's tissue model and its sampling; the defaults are the paper's, but for the stiffness, which it fits.
+    """The paper's tissue model and its sampling; the defaults are the paper's, but for the stiffness, which
+    it fits.
 
     Particles are ``radius_mm`` apart, chosen from voxels of ``radius_mm / volume_sampling``; clusters are
-    ``cluster_spacing`` radii apart and reach as far. The tissue's stiffness depends on all of these and on the
-    solver's iterations, not on ``stiffness`` alone: that is this method's limitation. Nor does ``density_g_cm3`` change
-    its motion, for all particles weigh the same. The presets are the paper's particles.
+    ``cluster_spacing`` radii apart and reach as far. The tissue's stiffness depends on all of these and on
+    the solver's iterations, not on ``stiffness`` alone: that is this method's limitation. Nor does
+    ``density_g_cm3`` change its motion, for all particles weigh the same. The presets are the paper's
+    particles.
     """
 
     size_key, piece_name = "radius_mm", "particles"
     report_line = (
-        "shape matching, stiffness {stiffness:g}: {particles} particles of {radius_mm:g} mm, {clusters} clusters, "
+        "shape matching, stiffness {stiffness:g}: {particles} particles of {radius_mm:g} mm, {clusters} "
+        "clusters, "
         "{memberships} memberships"
     )
     presets: ClassVar = dict(fast=dict(radius_mm=3.3), balanced={}, accurate=dict(radius_mm=2.2))

@@ -1,4 +1,6 @@
-"""Measures of a renal tumour for nephrometry: size, exophytic share, contact surface area, distances to the structures around it."""
+"""Measures of a renal tumour for nephrometry: size, exophytic share, contact surface area, distances to
+the structures around it.
+"""
 
 from dataclasses import dataclass
 
@@ -16,8 +18,9 @@ from scenes.surfaces import signed_distance_from
 POINTS = 20_000
 # The tumour's surface is in contact with the kidney where the point this far outside it is in the organ.
 CONTACT_MM = 0.5
-# Labels do not tell a main vessel from its branches: one at least this wide counts as the main one. An estimate, between main renal
-# artery (5 to 6 mm) and vein (10 to 12 mm) and their first branches, about half as wide.
+# Labels do not tell a main vessel from its branches: one at least this wide counts as the main one. An
+# estimate, between main renal artery (5 to 6 mm) and vein (10 to 12 mm) and their first branches, about half
+# as wide.
 MAIN_DIAMETER_MM = {"artery": 4.0, "vein": 7.0, "vessel": 4.0}
 # Main vessels are searched this far around the tumour, and touch it within this distance.
 AROUND_MM, TOUCH_MM = 15.0, 1.0
@@ -37,7 +40,9 @@ class TumourAnatomy:
     contact_cm2: float
     """Contact surface area."""
     distance_mm: dict[str, float]
-    """Least distance from the surface to each labelled structure: urine (collecting system), sinus, artery, vein, vessel."""
+    """Least distance from the surface to each labelled structure: urine (collecting system), sinus,
+    artery, vein, vessel.
+    """
     touches_main_vessel: bool | None
     axes: KidneyAxes
     heights_mm: tuple[float, float]
@@ -101,8 +106,9 @@ def points_inside(surface: trimesh.Trimesh) -> np.ndarray:
 def exophytic_share(points: np.ndarray, contour: trimesh.Trimesh) -> float:
     """Share of points (n, 3) outside the kidney's contour.
 
-    The contour is the convex hull of the kidney without the tumour, as in the computer-generated scores of Heller et al. 2022
-    (J Urol 207, 1105), but in space instead of on axial slices, so that it follows the kidney's long axis.
+    The contour is the convex hull of the kidney without the tumour, as in the computer-generated scores of
+    Heller et al. 2022 (J Urol 207, 1105), but in space instead of on axial slices, so that it follows the
+    kidney's long axis.
     """
     return float(1 - _inside(contour, points).mean())
 
@@ -110,10 +116,11 @@ def exophytic_share(points: np.ndarray, contour: trimesh.Trimesh) -> float:
 def contact_mm2(organ: trimesh.Trimesh, tumour: trimesh.Trimesh) -> float:
     """Contact surface area [mm^2]: of the tumour's triangles that have the kidney beyond them.
 
-    As Bulanti et al. 2024 (arXiv:2402.16857; J Imaging 2025, 11, 78), it is the area of triangles of the segmented tumour, without an assumption
-    about its shape. They search the triangles near the surface of the kidney without tumour; here the organ's surface
-    encloses the tumour, so a triangle counts where the organ goes on CONTACT_MM beyond it. For a ball cut by a plane at depth d, both
-    are 2 pi r d, the formula of Hsieh et al. 2016 (J Urol 196, 33) after Leslie et al. 2014 (Eur Urol 66, 884).
+    As Bulanti et al. 2024 (arXiv:2402.16857; J Imaging 2025, 11, 78), it is the area of triangles of the
+    segmented tumour, without an assumption about its shape. They search the triangles near the surface of the
+    kidney without tumour; here the organ's surface encloses the tumour, so a triangle counts where the organ
+    goes on CONTACT_MM beyond it. For a ball cut by a plane at depth d, both are 2 pi r d, the formula of
+    Hsieh et al. 2016 (J Urol 196, 33) after Leslie et al. 2014 (Eur Urol 66, 884).
     """
     beyond = tumour.triangles_center + CONTACT_MM * tumour.face_normals
     return float(tumour.area_faces[signed_distance_from(organ, beyond) < 0].sum())
@@ -134,12 +141,16 @@ def vessels_of(labels: Grid | None, tissues: dict[int, str]) -> dict[str, Grid]:
 
 
 def reaches_kidney(vessel: Grid, contour: trimesh.Trimesh) -> bool:
-    """Whether a labelled vessel is the kidney's own, which ends in its contour; aorta and vena cava do not."""
+    """Whether a labelled vessel is the kidney's own, which ends in its contour; aorta and vena cava do
+    not.
+    """
     return bool(_inside(contour, _places(vessel, np.argwhere(vessel.voxels))).any())
 
 
 def voxel_distance_mm(tumour: trimesh.Trimesh, vessel: Grid) -> float:
-    """Least distance [mm] from a surface to the border of labelled voxels, half a voxel from their centres; 0 where they meet."""
+    """Least distance [mm] from a surface to the border of labelled voxels, half a voxel from their
+    centres; 0 where they meet.
+    """
     indices = np.argwhere(vessel.voxels)
     squared, _, nearest = igl.point_mesh_squared_distance(
         _places(vessel, indices),
@@ -153,7 +164,8 @@ def voxel_distance_mm(tumour: trimesh.Trimesh, vessel: Grid) -> float:
 
 
 def main_vessel_gap_mm(tumour: trimesh.Trimesh, vessel: Grid, least_diameter_mm: float) -> float:
-    """Distance [mm] from a surface to the part of a vessel that is at least so wide; infinite where there is none near.
+    """Distance [mm] from a surface to the part of a vessel that is at least so wide; infinite where there is
+    none near.
 
     This part is the union of the balls inside the label that have this diameter.
     """
@@ -174,7 +186,9 @@ def main_vessel_gap_mm(tumour: trimesh.Trimesh, vessel: Grid, least_diameter_mm:
 
 
 def touches_main_vessel(tumour: trimesh.Trimesh, vessels: dict[str, Grid]) -> bool | None:
-    """Whether a surface touches the main renal artery or vein; None where it touches none, and not both kinds are labelled."""
+    """Whether a surface touches the main renal artery or vein; None where it touches none, and not both
+    kinds are labelled.
+    """
     gaps = [main_vessel_gap_mm(tumour, vessel, MAIN_DIAMETER_MM[kind]) for kind, vessel in vessels.items()]
     if gaps and min(gaps) <= TOUCH_MM:
         return True

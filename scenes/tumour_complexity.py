@@ -81,7 +81,10 @@ class Complexity:
 
 
 def complexity(anatomy: LoadedAnatomy, hilum_mm: Vector3 | None) -> Complexity | None:
-    """The complexity of a kidney's largest tumour; None without a tumour. ``hilum_mm``: for where no sinus is labelled."""
+    """The complexity of a kidney's largest tumour; None without a tumour.
+
+    ``hilum_mm``: for where no sinus is labelled.
+    """
     if anatomy.tumour is None:
         return None
     tumour = tumour_anatomy(

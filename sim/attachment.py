@@ -1,4 +1,6 @@
-"""How the organ is attached to what is around it: fixed, or by elastic tethers to where it was segmented (NumPy)."""
+"""How the organ is attached to what is around it: fixed, or by elastic tethers to where it was segmented
+(NumPy).
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,12 +15,16 @@ from sim.sampling import SamplingError
 
 
 def nodes_within(nodes: np.ndarray, at_mm: np.ndarray, radius_mm: float) -> np.ndarray:
-    """Mask (n,) of the nodes (n, 3) within a radius [mm] of a point (3,). Raises SamplingError where it is none or all of them."""
+    """Mask (n,) of the nodes (n, 3) within a radius [mm] of a point (3,).
+
+    Raises SamplingError where it is none or all of them.
+    """
     distance = np.linalg.norm(nodes - at_mm, axis=1)
     within = distance <= radius_mm
     if within.all() or not within.any():
         raise SamplingError(
-            f"an attachment of radius_mm = {radius_mm:g} holds {'all' if within.all() else 'none'} of the organ, which is "
+            f"an attachment of radius_mm = {radius_mm:g} holds {'all' if within.all() else 'none'} of the "
+            "organ, which is "
             f"{distance.min():.1f} to {distance.max():.1f} mm from its centre: choose another radius or point"
         )
     return within
@@ -32,7 +38,10 @@ class FixedRegion:
     radius_mm: float
 
     def nodes(self, nodes: np.ndarray) -> np.ndarray:
-        """Mask (n,) of the nodes (n, 3) that are fixed. Raises SamplingError where it is none or all of them."""
+        """Mask (n,) of the nodes (n, 3) that are fixed.
+
+        Raises SamplingError where it is none or all of them.
+        """
         return nodes_within(nodes, self.at_mm, self.radius_mm)
 
 
@@ -46,7 +55,9 @@ class Tether(Protocol):
 
 @dataclass(frozen=True)
 class Pedicle:
-    """Vessels and ureter as springs on the tissue within a radius [mm] of the hilum (3,) [mm]; together ``stiffness_n_mm``."""
+    """Vessels and ureter as springs on the tissue within a radius [mm] of the hilum (3,) [mm]; together
+    ``stiffness_n_mm``.
+    """
 
     at_mm: np.ndarray
     radius_mm: float
@@ -61,7 +72,9 @@ class Pedicle:
 
 @dataclass(frozen=True)
 class PerirenalFat:
-    """Fat around the organ as an elastic foundation (Winkler): ``stiffness_kpa_mm`` on the surface, but where it faces ``exposed`` (3,)."""
+    """Fat around the organ as an elastic foundation (Winkler): ``stiffness_kpa_mm`` on the surface, but
+    where it faces ``exposed`` (3,).
+    """
 
     stiffness_kpa_mm: float
     exposed: np.ndarray

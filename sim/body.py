@@ -19,7 +19,8 @@ class BodyState:
 class Body:
     """Particles or nodes; vectors are float32 fields of shape (n,).
 
-    ``rest_points`` (n, 3) float64 [mm] are the rest positions; ``predicted`` [mm] the predicted positions of a substep.
+    ``rest_points`` (n, 3) float64 [mm] are the rest positions; ``predicted`` [mm] the predicted positions of
+    a substep.
     """
 
     mass_scaled = False
@@ -50,7 +51,8 @@ class Body:
 
 
 class ParticleBody(Body):
-    """A body of particles. ``contact_radius`` (n,) [mm]: smallest allowed distance of each particle's centre from a shape.
+    """A body of particles. ``contact_radius`` (n,) [mm]: smallest allowed distance of each particle's centre
+    from a shape.
 
     ``mass_scaling_per_mm`` is k of Algorithm 1, line 4; at 0 there is no ``mass_scale`` (n,).
     """

@@ -1,8 +1,9 @@
 """The organ's capsule: a thin elastic membrane on its surface, carried by the lattice.
 
-Incompressible neo-Hookean material in plane stress, W = mu h / 2 (tr C + 1 / det C - 3) for the surface's C = F^T F (2 x 2), with
-mu h = E h / 3 of modulus E and thickness h (Holzapfel 2000, ch. 6; the capsule's: Snedeker et al. 2005). A membrane so thin has no
-resistance to compression: it wrinkles, and W is relaxed to that of tension alone (Pipkin 1986).
+Incompressible neo-Hookean material in plane stress, W = mu h / 2 (tr C + 1 / det C - 3) for the surface's C =
+F^T F (2 x 2), with mu h = E h / 3 of modulus E and thickness h (Holzapfel 2000, ch. 6; the capsule's:
+Snedeker et al. 2005). A membrane so thin has no resistance to compression: it wrinkles, and W is relaxed to
+that of tension alone (Pipkin 1986).
 """
 
 import numpy as np
@@ -23,7 +24,8 @@ N_MM = 1e6
 class Capsule:
     """Patches of the surface, each in one cell of the lattice.
 
-    ``stiffness_n_mm`` is modulus times thickness [N/mm]. deformation (p,): F (3, 2) of each patch, from its tangential axes.
+    ``stiffness_n_mm`` is modulus times thickness [N/mm]. deformation (p,): F (3, 2) of each patch, from its
+    tangential axes.
     """
 
     def __init__(self, body: Body, lattice: Lattice, surface: trimesh.Trimesh, stiffness_n_mm: float) -> None:
@@ -67,7 +69,9 @@ class Capsule:
 
     @ti.func
     def node_force(self, i):
-        """Force [uN] of the membrane on node i, and a positive bound of its negative derivative (3, 3) by the node's position."""
+        """Force [uN] of the membrane on node i, and a positive bound of its negative derivative (3, 3) by
+        the node's position.
+        """
         force, stiffness = tm.vec3(0.0), tm.mat3(0.0)
         for k in range(self.start[i], self.start[i + 1]):
             q, b = self.patch[k], self.slope[k]
@@ -88,8 +92,8 @@ class Capsule:
 
 @ti.func
 def patch_force(u, v, b):
-    """P b, the derivative of W / (mu h) by a node whose shape function has the tangential gradient b, for F = (u, v); and a positive
-    bound of its derivative.
+    """P b, the derivative of W / (mu h) by a node whose shape function has the tangential gradient b, for F =
+    (u, v); and a positive bound of its derivative.
     """
     force, stiffness = tm.vec3(0.0), tm.mat3(0.0)
     uu, uv, vv = u.dot(u), u.dot(v), v.dot(v)

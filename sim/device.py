@@ -23,10 +23,12 @@ class NoDevice(RuntimeError):
 
 
 def start(arch: str = "cpu", accepts_wrong_results: bool = False, **options) -> str:
-    """Initialise Taichi on a named backend or ``auto`` (CUDA if available, else the CPU); return the backend's name.
+    """Initialise Taichi on a named backend or ``auto`` (CUDA if available, else the CPU); return the
+    backend's name.
 
-    ``options`` are passed to ``ti.init``. Where Taichi already runs so, it goes on, with its compiled kernels; another start invalidates
-    all fields that are not in a CPU's memory. Raises NoDevice, also for a driver whose results are wrong, unless it is asked for all the same.
+    ``options`` are passed to ``ti.init``. Where Taichi already runs so, it goes on, with its compiled
+    kernels; another start invalidates all fields that are not in a CPU's memory. Raises NoDevice, also for a
+    driver whose results are wrong, unless it is asked for all the same.
     """
     global _started
     if arch == "auto":
@@ -38,7 +40,8 @@ def start(arch: str = "cpu", accepts_wrong_results: bool = False, **options) -> 
     if arch != "cpu" and not is_available(arch):
         raise NoDevice(f"this machine has no {arch} device or driver; use --arch cpu or --arch auto")
     options = {
-        # LLVM and the graphics drivers optimise too: without Taichi's own pass large kernels compile four to ten times as fast.
+        # LLVM and the graphics drivers optimise too: without Taichi's own pass large kernels compile four to
+        # ten times as fast.
         "advanced_optimization": False,
         "offline_cache_file_path": str(taichi_internals.kernel_folder()),
         "offline_cache_max_size_of_files": CACHE_BYTES,
@@ -49,7 +52,8 @@ def start(arch: str = "cpu", accepts_wrong_results: bool = False, **options) -> 
     if arch == "vulkan" and not accepts_wrong_results and not counts_correctly():
         ti.reset()
         raise NoDevice(
-            "the Vulkan driver of this machine gives wrong results, as Mesa 22's software driver does; use --arch cpu, or a newer driver"
+            "the Vulkan driver of this machine gives wrong results, as Mesa 22's software driver does; use "
+            "--arch cpu, or a newer driver"
         )
     _started = taichi_internals.program(), *asked
     return arch
@@ -99,7 +103,7 @@ def on_cpu() -> bool:
 def is_too_small(count: int, parallel_from: int) -> bool:
     """Whether a body of ``count`` particles or nodes steps faster on one core of a CPU than on all cores.
 
-    With few cores, exchanging data between them takes longer than they save. This depends on the machine and not on the
-    number of threads that Taichi uses, because results must not depend on that.
+    With few cores, exchanging data between them takes longer than they save. This depends on the machine and
+    not on the number of threads that Taichi uses, because results must not depend on that.
     """
     return on_cpu() and ((os.cpu_count() or 1) < FEW_CORES or count < parallel_from)

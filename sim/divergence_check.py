@@ -28,16 +28,20 @@ MOST_TANGLED = 0.005
 PATIENCE_S, PATIENCE_STEPS = 2.0, 120
 # Interval at which good states are stored.
 KEEP_S, KEEP_STEPS = 1.0, 60
-# A point this far from the body's rest centre has left the scene; beyond the second distance it counts as not finite.
+# A point this far from the body's rest centre has left the scene; beyond the second distance it counts as not
+# finite.
 FARTHEST_MM, INFINITE_MM = 500.0, 1e12
 
-# All bits of a float32 but its sign, and those of INFINITE_MM: they are ordered as the numbers are, and what is no number is above.
+# All bits of a float32 but its sign, and those of INFINITE_MM: they are ordered as the numbers are, and what
+# is no number is above.
 MAGNITUDE, INFINITE_BITS = 0x7FFFFFFF, int(np.float32(INFINITE_MM).view(np.int32))
 
 
 @dataclass(frozen=True)
 class Health:
-    """Result of one check: ``tangled`` is the fraction of tetrahedra that are torn, flat or inverted and not near the tool."""
+    """Result of one check: ``tangled`` is the fraction of tetrahedra that are torn, flat or inverted and
+    not near the tool.
+    """
 
     finite: bool
     farthest_mm: float
@@ -60,8 +64,8 @@ class Health:
 
 @dataclass(frozen=True)
 class DivergenceState:
-    """State of the check between steps: the last good state, the steps since then and since the tissue is tangled, whether that state has
-    been restored since, and the time [s] since then.
+    """State of the check between steps: the last good state, the steps since then and since the tissue is
+    tangled, whether that state has been restored since, and the time [s] since then.
     """
 
     good: SolverState
@@ -105,7 +109,9 @@ class DivergenceCheck:
         fill((self.per_volume, 1.0 / np.linalg.det(edges)), (self.corner, corners), (self.longest, longest))
 
     def test_among(self, is_tissue: np.ndarray) -> None:
-        """Test only tetrahedra of points that are tissue (n,), as many as before; more of them are tested twice where there are fewer."""
+        """Test only tetrahedra of points that are tissue (n,), as many as before; more of them are tested
+        twice where there are fewer.
+        """
         among = np.flatnonzero(is_tissue)
         if self.has_tetrahedra:
             corners = among[tetrahedra_among(self.body.rest_points[among])]
@@ -123,7 +129,10 @@ class DivergenceCheck:
             self.state = DivergenceState(self.solver.snapshot())
 
     def check(self, time_step_s: float) -> str:
-        """Check the body after a step. If it diverged, restore a good state and return a message, else an empty text."""
+        """Check the body after a step.
+
+        If it diverged, restore a good state and return a message, else an empty text.
+        """
         health = self.health()
         is_tangled = health.tangled > MOST_TANGLED
         state = replace(
@@ -158,7 +167,9 @@ class DivergenceCheck:
 
     @kernel
     def _examine(self) -> tm.vec3:
-        """Numbers of points that are not finite and of tangled tetrahedra, and the distance of the farthest point."""
+        """Numbers of points that are not finite and of tangled tetrahedra, and the distance of the
+        farthest point.
+        """
         # Counts and maxima do not depend on the order, so these atomics are deterministic.
         self.faults[None] = ti.Vector([0, 0])
         self.farthest[None] = 0.0
@@ -195,7 +206,9 @@ class DivergenceCheck:
 
 @ti.func
 def is_finite(x):
-    """Whether a position has numbers below INFINITE_MM alone: by their bits, as comparisons with what is no number may be left out."""
+    """Whether a position has numbers below INFINITE_MM alone: by their bits, as comparisons with what is
+    no number may be left out.
+    """
     finite = True
     for k in ti.static(range(3)):
         finite &= (ti.bit_cast(x[k], ti.i32) & MAGNITUDE) < INFINITE_BITS

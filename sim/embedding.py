@@ -1,7 +1,7 @@
 """A coarse tetrahedral mesh embedded in the body: it maps deformed points to rest points.
 
-The paper's method for the CT slice in the ultrasound plane ("Weighted matrix blending"): barycentric coordinates of the plane in
-the deformed tetrahedra give its rest positions.
+The paper's method for the CT slice in the ultrasound plane ("Weighted matrix blending"): barycentric
+coordinates of the plane in the deformed tetrahedra give its rest positions.
 """
 
 from itertools import permutations
@@ -31,12 +31,13 @@ PARALLEL_FROM = 1_000_000
 class Embedding:
     """Tetrahedra of a regular grid around a closed surface, whose vertices move with the tissue.
 
-    ``tetrahedron`` (m,): four vertex indices each, of a rest mesh without gaps (Kuhn's six tetrahedra per cell). Outside the
-    body they move with the nearest point of its surface, but less with the distance and not at all at ``margin_mm``, so that the
-    surroundings deform without gaps; ``share`` (n,) is the factor of each vertex.
+    ``tetrahedron`` (m,): four vertex indices each, of a rest mesh without gaps (Kuhn's six tetrahedra per
+    cell). Outside the body they move with the nearest point of its surface, but less with the distance and
+    not at all at ``margin_mm``, so that the surroundings deform without gaps; ``share`` (n,) is the factor of
+    each vertex.
 
-    ``rest_from_plane`` (m + 1,) maps (u, v, w) of an image plane [mm] to rest positions, for each tetrahedron that
-    ``locate_on_plane`` found on it; the last is for points in no tetrahedron, which do not move.
+    ``rest_from_plane`` (m + 1,) maps (u, v, w) of an image plane [mm] to rest positions, for each tetrahedron
+    that ``locate_on_plane`` found on it; the last is for points in no tetrahedron, which do not move.
     """
 
     def __init__(
@@ -75,11 +76,12 @@ class Embedding:
         columns: int,
         owner: ti.template(),
     ):
-        """Write to the first rows and columns of ``owner``, i32, the tetrahedron at each pixel of an image plane, ``count`` where there is none.
+        """Write to the first rows and columns of ``owner``, i32, the tetrahedron at each pixel of an image
+        plane, ``count`` where there is none.
 
-        The two matrices map world [mm] to (u, v, w), with the plane at w = 0, and back; pixel (row, column) is at u =
-        first.x + column * pixel.x, v = first.y + row * pixel.y. Of overlapping tetrahedra the lowest index is taken,
-        independent of threads; inverted and flat ones are left out.
+        The two matrices map world [mm] to (u, v, w), with the plane at w = 0, and back; pixel (row, column)
+        is at u = first.x + column * pixel.x, v = first.y + row * pixel.y. Of overlapping tetrahedra the
+        lowest index is taken, independent of threads; inverted and flat ones are left out.
         """
         for row in range(rows):
             for column in range(columns):
@@ -99,7 +101,9 @@ class Embedding:
 
     @ti.func
     def mark(self, t, node, pixel_mm, first_mm, rows, columns, owner: ti.template()):
-        """Mark the pixels of a tetrahedron that the plane cuts, and store its map to rest positions, if any are in the image."""
+        """Mark the pixels of a tetrahedron that the plane cuts, and store its map to rest positions, if
+        any are in the image.
+        """
         x = self.on_plane[node[0]]
         low, high = x, x
         for k in ti.static(range(1, 4)):
@@ -110,7 +114,8 @@ class Embedding:
             b, c = self.edge(node, 2), self.edge(node, 3)
             six_volumes = a.dot(b.cross(c))
             if six_volumes > FLAT:
-                # Gradients of the barycentric coordinates of the last three corners, and these coordinates at the plane's origin.
+                # Gradients of the barycentric coordinates of the last three corners, and these coordinates at
+                # the plane's origin.
                 slopes = ti.Matrix.rows([b.cross(c), c.cross(a), a.cross(b)]) / six_volumes
                 at = -(slopes @ tm.vec3(x, self.above_plane[node[0]]))
                 origin = self.skin.rest[node[0]]
@@ -193,17 +198,22 @@ class Unmoved:
 def _embedding_mesh(
     surface: trimesh.Trimesh, cell_mm: float, margin_mm: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (v, 3) [mm], tetrahedra (t, 4) in their order, each vertex's share (v,), and the tissue (v, 3) that it moves with."""
+    """Vertices (v, 3) [mm], tetrahedra (t, 4) in their order, each vertex's share (v,), and the tissue (v,
+    3) that it moves with.
+    """
     vertices, tetrahedra = tetrahedra_around(surface, cell_mm, margin_mm)
-    # A tetrahedron that contains tissue extends this far outside: all of its vertices must move with the tissue.
+    # A tetrahedron that contains tissue extends this far outside: all of its vertices must move with the
+    # tissue.
     extent = np.sqrt(3) * cell_mm
     distance, face = signed_distance(surface.vertices, surface.faces, vertices)
     outside = np.maximum(distance, 0.0)
-    # Extrapolated along their gradient at the surface, displacements would fold the surroundings where a probe presses.
+    # Extrapolated along their gradient at the surface, displacements would fold the surroundings where a
+    # probe presses.
     on_surface = trimesh.triangles.closest_point(surface.triangles[face], vertices)
     at = np.where(outside[:, None] > 0, on_surface, vertices)
     beyond = np.maximum(outside - extent, 0.0)
-    # Where tetrahedra overlap after deformation, the lowest index is taken: those in or nearest to the organ come first.
+    # Where tetrahedra overlap after deformation, the lowest index is taken: those in or nearest to the organ
+    # come first.
     layer = np.ceil(outside[tetrahedra].min(axis=1) / cell_mm)
     share = np.clip(1.0 - beyond / max(margin_mm - extent, cell_mm), 0.0, 1.0)
     return vertices, tetrahedra[np.argsort(layer, kind="stable")], share, at
@@ -212,7 +222,8 @@ def _embedding_mesh(
 def tetrahedra_around(
     surface: trimesh.Trimesh, cell_mm: float, margin_mm: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (v, 3) float64 [mm] and tetrahedra (t, 4) of the grid cells whose centre is in the surface or near to it.
+    """Vertices (v, 3) float64 [mm] and tetrahedra (t, 4) of the grid cells whose centre is in the surface or
+    near to it.
 
     Near: no farther outside than the margin and half of the cell's diagonal.
     """

@@ -1,4 +1,5 @@
-"""Fields: arrays on the device, which kernels read and write (``sim.kernels``), and copies of them to and from NumPy.
+"""Fields: arrays on the device, which kernels read and write (``sim.kernels``), and copies of them to and
+from NumPy.
 
 A kernel does not depend on the size of a field, so that one kernel serves the fields of all patients.
 """
@@ -13,7 +14,8 @@ from sim.device import on_cpu
 
 
 class Field:
-    """An array of numbers, vectors or matrices: ``element`` is the shape of one of them, ``shape`` that of the field, ``kind`` f32 or i32.
+    """An array of numbers, vectors or matrices: ``element`` is the shape of one of them, ``shape`` that of
+    the field, ``kind`` f32 or i32.
 
     ``memory`` is a NumPy array (*shape, *element) on a CPU, else a Taichi ndarray; new fields are zero.
     """
@@ -37,7 +39,10 @@ class Field:
 
 
 def zeros(*shape: int, within: int = 0, kind: type = ti.f32) -> Field:
-    """A field of zeros. The last ``within`` axes are those of an element: 0 for numbers, 1 for vectors, 2 for matrices."""
+    """A field of zeros.
+
+    The last ``within`` axes are those of an element: 0 for numbers, 1 for vectors, 2 for matrices.
+    """
     return Field(shape, within, kind)
 
 

@@ -1,7 +1,9 @@
-"""Coulomb's law of friction, for all contacts: of the surface and of particles with shapes, and between particles.
+"""Coulomb's law of friction, for all contacts: of the surface and of particles with shapes, and between
+particles.
 
-|friction| <= coefficient x normal. Each contact measures both in its own unit: as elastic slip and depth times stiffness
-(``SurfaceContacts.tangential_slip``, return mapping), or as displacements (``ShapeContacts.friction_change``, ``SelfContacts.project``).
+|friction| <= coefficient x normal. Each contact measures both in its own unit: as elastic slip and depth
+times stiffness (``SurfaceContacts.tangential_slip``, return mapping), or as displacements
+(``ShapeContacts.friction_change``, ``SelfContacts.project``).
 """
 
 import taichi as ti

@@ -1,7 +1,7 @@
 """A regular lattice of hexahedral elements, the cells of a grid, that fills a closed surface (NumPy).
 
-No mesh has to fit the organ: cells that contain tissue are kept, and those cut by the surface are integrated over their
-filled part (finite cell method, Parvizian, Duester & Rank 2007).
+No mesh has to fit the organ: cells that contain tissue are kept, and those cut by the surface are integrated
+over their filled part (finite cell method, Parvizian, Duester & Rank 2007).
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,8 @@ from sim.stored_arrays import stored
 
 # Corners of a cell, x slowest.
 CORNERS = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
-# A cut cell is integrated over this many samples along each edge; distances are interpolated from 3 x 3 x 3 points.
+# A cut cell is integrated over this many samples along each edge; distances are interpolated from 3 x 3 x 3
+# points.
 SAMPLES = 6
 SAMPLE_POINTS = (np.indices((SAMPLES,) * 3).reshape(3, -1).T + 0.5) / SAMPLES
 # Stiffness of the empty part of a cut cell, relative to the tissue's, so that every node has some.
@@ -43,11 +44,12 @@ MOST_VOLUME_ERROR = 0.1
 class Lattice:
     """Cells and nodes at rest [mm]; nodes of one colour share no cell and are numbered consecutively.
 
-    nodes (n, 3); colour_start (9,): first node of each of the 8 colours; cells (m, 8): nodes at CORNERS; gradient
-    (m, 8, 3) [1/mm]: B, the gradients of the corners' shape functions, averaged over the cell's filled part; volume (m,)
-    [mm^3]: elastic volume; hourglass (m, 8, 8) [mm]: integral of (B - mean B)(B - mean B)^T over the filled part;
-    tissue (m, 8) [mm^3]: volume of tissue of each corner; share (m, parts): volume share of each part of the organ;
-    index_of (x, y, z): the cell at a position of the grid that starts at low_mm, -1 where there is none.
+    nodes (n, 3); colour_start (9,): first node of each of the 8 colours; cells (m, 8): nodes at CORNERS;
+    gradient (m, 8, 3) [1/mm]: B, the gradients of the corners' shape functions, averaged over the cell's
+    filled part; volume (m,) [mm^3]: elastic volume; hourglass (m, 8, 8) [mm]: integral of (B - mean B)(B -
+    mean B)^T over the filled part; tissue (m, 8) [mm^3]: volume of tissue of each corner; share (m, parts):
+    volume share of each part of the organ; index_of (x, y, z): the cell at a position of the grid that starts
+    at low_mm, -1 where there is none.
     """
 
     cell_mm: float
@@ -63,7 +65,9 @@ class Lattice:
     index_of: np.ndarray
 
     def node_mass(self, density: np.ndarray) -> np.ndarray:
-        """Mass (n,) of each node for a density (m,) of each cell, in the density's unit of mass for 1 mm^3."""
+        """Mass (n,) of each node for a density (m,) of each cell, in the density's unit of mass for 1
+        mm^3.
+        """
         return np.bincount(self.cells.ravel(), (density[:, None] * self.tissue).ravel(), len(self.nodes))
 
     @property
@@ -85,7 +89,8 @@ class CellInterpolation:
     def attach(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nodes (k, 8) and trilinear weights (k, 8), which sum to 1, of points (k, 3) [mm].
 
-        Points outside all cells are extrapolated linearly from the nearest cell, for one width of a cell at most.
+        Points outside all cells are extrapolated linearly from the nearest cell, for one width of a cell at
+        most.
         """
         cell, inside = places_in_cells(points, self.cell_mm, self.low_mm, self.index_of)
         return self.cells[cell], shape_functions(inside)
@@ -99,7 +104,9 @@ class CellInterpolation:
         return points + self.displacement(self.attach(points), position)
 
     def displacement(self, at: tuple[np.ndarray, np.ndarray], position: np.ndarray) -> np.ndarray:
-        """Displacement (k, 3) [mm] at places with these nodes and weights (k, 8), for positions (n, 3) [mm] of the nodes."""
+        """Displacement (k, 3) [mm] at places with these nodes and weights (k, 8), for positions (n, 3)
+        [mm] of the nodes.
+        """
         nodes, weights = at
         return np.einsum("kn,kna->ka", weights, (position - self.nodes)[nodes])
 
@@ -107,7 +114,9 @@ class CellInterpolation:
 def places_in_cells(
     points: np.ndarray, cell_mm: float, low_mm: np.ndarray, index_of: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The cell (k,) of points (k, 3) [mm], or the nearest one, and their places (k, 3) in the unit cell, in it or beside it."""
+    """The cell (k,) of points (k, 3) [mm], or the nearest one, and their places (k, 3) in the unit cell,
+    in it or beside it.
+    """
     at = (np.asarray(points, float) - low_mm) / cell_mm
     index = np.clip(np.floor(at).astype(int), 0, np.array(index_of.shape) - 1)
     cell = index_of[tuple(index.T)]
@@ -136,14 +145,17 @@ def shape_gradients(at: np.ndarray) -> np.ndarray:
 def fill_with_cells(
     surface: trimesh.Trimesh, cell_mm: float, parts: Sequence[trimesh.Trimesh] = ()
 ) -> Lattice:
-    """The lattice of a closed surface [mm], with the shares of parts inside it; where parts overlap, the later one counts.
+    """The lattice of a closed surface [mm], with the shares of parts inside it; where parts overlap, the
+    later one counts.
 
-    Raises SamplingError when the cells are too many for a step or for the memory, or too large for the surface's shape.
+    Raises SamplingError when the cells are too many for a step or for the memory, or too large for the
+    surface's shape.
     """
     size = _grid_around(surface, cell_mm)[1]
     if size.prod() > 50 * MOST_CELLS or surface.volume / cell_mm**3 > MOST_CELLS:
         raise SamplingError(
-            f"cells of {cell_mm:g} mm are more than {MOST_CELLS} in an organ of {surface.volume / 1000:.0f} ml: "
+            f"cells of {cell_mm:g} mm are more than {MOST_CELLS} in an organ of {surface.volume / 1000:.0f} "
+            "ml: "
             "choose larger ones"
         )
     check_memory(CELL_BYTES * surface.volume / cell_mm**3, f"cells of {cell_mm:g} mm", "choose larger ones")
@@ -169,7 +181,9 @@ def _grid_around(surface: trimesh.Trimesh, cell_mm: float) -> tuple[np.ndarray, 
 def fill_block(
     counts: tuple[int, int, int], cell_mm: float, parts: Sequence[trimesh.Trimesh] = ()
 ) -> Lattice:
-    """The lattice of a block with a corner at the origin and ``counts`` cells along each axis; parts as in ``fill_with_cells``."""
+    """The lattice of a block with a corner at the origin and ``counts`` cells along each axis; parts as in
+    ``fill_with_cells``.
+    """
     indices = np.indices(counts).reshape(3, -1).T
     filled = np.ones((len(indices), len(SAMPLE_POINTS)))
     return _assemble(np.zeros(3), cell_mm, np.array(counts), indices, filled, parts)
@@ -178,7 +192,9 @@ def fill_block(
 def _filled(
     surface: trimesh.Trimesh, low: np.ndarray, cell_mm: float, indices: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Grid positions (m, 3) of the cells that contain tissue, and the filled fraction (m, s) around each integration point."""
+    """Grid positions (m, 3) of the cells that contain tissue, and the filled fraction (m, s) around each
+    integration point.
+    """
     centre = signed_distance(surface.vertices, surface.faces, low + cell_mm * (indices + 0.5))[0]
     reach = cell_mm * np.sqrt(3) / 2
     indices, centre = indices[centre < reach], centre[centre < reach]
@@ -213,7 +229,8 @@ def shares(
         centre = signed_distance(part.vertices, part.faces, low + cell_mm * (indices + 0.5))[0]
         fraction = np.repeat((centre < 0)[:, None].astype(float), len(SAMPLE_POINTS), axis=1)
         cut = np.abs(centre) < cell_mm * np.sqrt(3) / 2
-        # The distance at each sample: parts may be thin, or extend beyond the organ, so that no volume could correct it.
+        # The distance at each sample: parts may be thin, or extend beyond the organ, so that no volume could
+        # correct it.
         samples = low + cell_mm * (indices[cut][:, None] + SAMPLE_POINTS)
         distance = signed_distance(part.vertices, part.faces, samples.reshape(-1, 3))[0]
         fraction[cut] = np.clip(0.5 - distance.reshape(-1, len(SAMPLE_POINTS)) / (cell_mm / SAMPLES), 0, 1)
@@ -278,8 +295,8 @@ def gradients(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def surface_patches(
     surface: trimesh.Trimesh, cell_mm: float, low_mm: np.ndarray, cells: np.ndarray, index_of: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Patches of a surface, one for each cell and direction that it faces: nodes (p, 8), tangential gradients (p, 8, 2) [1/mm] of
-    their shape functions, averaged over the patch, and areas (p,) [mm^2].
+    """Patches of a surface, one for each cell and direction that it faces: nodes (p, 8), tangential gradients
+    (p, 8, 2) [1/mm] of their shape functions, averaged over the patch, and areas (p,) [mm^2].
     """
     _, area, normal, inside, keys, owner = faces_by_patch(surface, cell_mm, low_mm, index_of)
     total = np.bincount(owner, area)
@@ -297,8 +314,8 @@ def surface_patches(
 def faces_by_patch(
     surface: trimesh.Trimesh, cell_mm: float, low_mm: np.ndarray, index_of: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Small faces of a surface: middles (f, 3) [mm], areas (f,) [mm^2], normals (f, 3), places (f, 3) in their unit cell; the cell and side
-    (p, 2) of each patch, and the patch (f,) of each face.
+    """Small faces of a surface: middles (f, 3) [mm], areas (f,) [mm^2], normals (f, 3), places (f, 3) in
+    their unit cell; the cell and side (p, 2) of each patch, and the patch (f,) of each face.
     """
     middle, area, normal = _small_faces(surface, cell_mm / 2)
     cell, inside = places_in_cells(middle, cell_mm, low_mm, index_of)
@@ -307,7 +324,8 @@ def faces_by_patch(
 
 
 def _small_faces(surface: trimesh.Trimesh, longest_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Middles (f, 3) [mm], areas (f,) [mm^2] and unit normals (f, 3) of a surface's faces, divided until no edge is longer.
+    """Middles (f, 3) [mm], areas (f,) [mm^2] and unit normals (f, 3) of a surface's faces, divided until no
+    edge is longer.
 
     Faces without area, which a cut can leave, are left out.
     """
@@ -347,7 +365,9 @@ def surface_points(surface: trimesh.Trimesh, spacing_mm: float) -> tuple[np.ndar
 
 
 def _unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """``np.unique`` with its inverse for rows (n, k) of integers, ten times as fast: it sorts one number for each row."""
+    """``np.unique`` with its inverse for rows (n, k) of integers, ten times as fast: it sorts one number
+    for each row.
+    """
     least = rows.min(axis=0)
     shape = tuple(rows.max(axis=0) - least + 1)
     keys, which = np.unique(np.ravel_multi_index(tuple((rows - least).T), shape), return_inverse=True)

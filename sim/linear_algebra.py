@@ -1,12 +1,14 @@
 """Linear algebra of small matrices in kernels: four-wide vectors, rotations, symmetric 3 x 3 systems.
 
-Four-wide vectors carry three numbers and a fourth: compilers use a processor's vector units only where no entry is left out.
+Four-wide vectors carry three numbers and a fourth: compilers use a processor's vector units only where no
+entry is left out.
 """
 
 import taichi as ti
 import taichi.math as tm
 
-# Below this determinant, relative to trace(S) cubed, the best rotation is not unique in float32 and Newton's step is not taken.
+# Below this determinant, relative to trace(S) cubed, the best rotation is not unique in float32 and Newton's
+# step is not taken.
 LEAST_DETERMINANT = 1e-3
 # The error of Newton's method is the cube of its last step [rad]: below float32's rounding.
 LAST_STEP_RAD = 0.01
@@ -34,10 +36,12 @@ def cross(a, b):
 
 @ti.func
 def nearest_rotation(matrix):
-    """Proper rotation R (det R = +1) that maximises trace(R^T matrix), for every matrix: also inverted, flat or tiny (Eq. 8).
+    """Proper rotation R (det R = +1) that maximises trace(R^T matrix), for every matrix: also inverted, flat
+    or tiny (Eq. 8).
 
-    Its quaternion is the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix (Horn 1987). The entries are
-    first divided by the largest, so that tiny matrices keep their digits. The zero matrix gives the identity.
+    Its quaternion is the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix (Horn 1987). The
+    entries are first divided by the largest, so that tiny matrices keep their digits. The zero matrix gives
+    the identity.
     """
     largest = 0.0
     for i, j in ti.static(ti.ndrange(3, 3)):
@@ -68,9 +72,11 @@ def horn_matrix(m):
 
 @ti.func
 def largest_eigenvector(symmetric):
-    """Eigenvector (4,), not of unit length, of the largest eigenvalue of a symmetric matrix (4, 4): power method by squaring.
+    """Eigenvector (4,), not of unit length, of the largest eigenvalue of a symmetric matrix (4, 4): power
+    method by squaring.
 
-    Where the two largest eigenvalues differ by less than 2^-SQUARINGS, any vector of their plane is as good in float32.
+    Where the two largest eigenvalues differ by less than 2^-SQUARINGS, any vector of their plane is as good
+    in float32.
     """
     power = symmetric + symmetric.norm() * tm.eye(4)
     for _ in range(SQUARINGS):
@@ -110,10 +116,11 @@ def rotation_near(guess, matrix):
 
 @ti.func
 def newton_step(rotation, matrix):
-    """Rotation vector [rad] of one Newton step to the maximum of trace(R^T matrix), and whether that maximum is unique.
+    """Rotation vector [rad] of one Newton step to the maximum of trace(R^T matrix), and whether that maximum
+    is unique.
 
-    With S = R^T matrix, the step w solves (tr(S) I - sym(S)) w = axial(S - S^T) (Kugelstadt et al. 2018). Where that
-    matrix is positive definite there is one maximum.
+    With S = R^T matrix, the step w solves (tr(S) I - sym(S)) w = axial(S - S^T) (Kugelstadt et al. 2018).
+    Where that matrix is positive definite there is one maximum.
     """
     s = rotation.transpose() @ matrix
     size = s[0, 0] + s[1, 1] + s[2, 2]
@@ -130,7 +137,9 @@ def newton_step(rotation, matrix):
 
 @ti.func
 def small_rotation(vector):
-    """Rotation of the quaternion (1, vector / 2): exactly orthogonal, and nearly that of a small rotation vector [rad]."""
+    """Rotation of the quaternion (1, vector / 2): exactly orthogonal, and nearly that of a small rotation
+    vector [rad].
+    """
     return rotation_of(tm.vec4(1.0, vector / 2))
 
 
@@ -157,7 +166,9 @@ def cross_matrix(a):
 
 @ti.func
 def inverse_of(matrix):
-    """Inverse of a positive definite 3 x 3 matrix, scaled by its trace: its determinant may overflow float32."""
+    """Inverse of a positive definite 3 x 3 matrix, scaled by its trace: its determinant may overflow
+    float32.
+    """
     unit = 1.0 / matrix.trace()
     return unit * (unit * matrix).inverse()
 

@@ -1,4 +1,6 @@
-"""Isotropic elastic materials, and their mixture in elements that several parts of the organ share (NumPy)."""
+"""Isotropic elastic materials, and their mixture in elements that several parts of the organ share
+(NumPy).
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -43,10 +45,12 @@ class Part:
 def mixture(
     outside: Material, parts: Sequence[Material], share: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """mu, lambda [g/(mm s^2)] and density [g/mm^3], (m,) each, of elements with volume shares (m, parts) of the parts.
+    """mu, lambda [g/(mm s^2)] and density [g/mm^3], (m,) each, of elements with volume shares (m, parts) of
+    the parts.
 
-    Voigt's rule: the means by volume. An element has one deformation gradient, so that this is its energy integrated over the
-    parts, as in the finite cell method; docs/method.md compares it with Reuss's rule and others.
+    Voigt's rule: the means by volume. An element has one deformation gradient, so that this is its energy
+    integrated over the parts, as in the finite cell method; docs/method.md compares it with Reuss's rule and
+    others.
     """
     materials = (outside, *parts)
     shares = np.column_stack([1 - share.sum(axis=1), share])

@@ -1,10 +1,11 @@
 """Compressible neo-Hookean tissue on a lattice of hexahedral elements, solved by vertex block descent.
 
-Implicit Euler as minimisation (Liu et al. 2013, Eq. 3): a step minimises m |x - inertial target|^2 / 2 h^2 + elastic and
-contact energy over the positions x. Vertex block descent (Chen et al. 2024) is a nonlinear Gauss-Seidel method: one Newton
-step for each node, all others fixed; here with successive over-relaxation. Elements have one integration point and hourglass
-stabilisation (Flanagan & Belytschko 1981); those cut by the surface are integrated as in the finite cell method.
-At convergence every node is in equilibrium, so the rest state does not depend on iterations, substeps or time step.
+Implicit Euler as minimisation (Liu et al. 2013, Eq. 3): a step minimises m |x - inertial target|^2 / 2 h^2 +
+elastic and contact energy over the positions x. Vertex block descent (Chen et al. 2024) is a nonlinear
+Gauss-Seidel method: one Newton step for each node, all others fixed; here with successive over-relaxation.
+Elements have one integration point and hourglass stabilisation (Flanagan & Belytschko 1981); those cut by the
+surface are integrated as in the finite cell method. At convergence every node is in equilibrium, so the rest
+state does not depend on iterations, substeps or time step.
 """
 
 from collections.abc import Sequence
@@ -34,8 +35,10 @@ from sim.surface_contact import PENALTY_DEPTH_MM, REACH_MM, SurfaceContacts
 from sim.tissue_model import ModelInputs
 from sim.viscoelasticity import PronyTerm, Relaxation
 
-# Stiffness, in units of the shear modulus, of deformation that varies inside an element. 1 + nu is exact for bending, 1 for u_x ~ y z,
-# 0.5 for torsion: the least of them, because elements so wide are too stiff around the edges of a probe (docs/method.md).
+# Stiffness, in units of the shear modulus, of deformation that varies inside an element. 1 + nu is exact for
+# bending, 1 for u_x ~ y z,
+# 0.5 for torsion: the least of them, because elements so wide are too stiff around the edges of a probe
+# (docs/method.md).
 HOURGLASS_STIFFNESS = 0.5
 # Below this volume ratio J, ln J is continued by its tangent, so that inverted elements recover.
 LEAST_J = 0.2
@@ -53,18 +56,22 @@ LATTICE_SETTINGS = StepSettings(substeps=1, iterations=4, relaxation_factor=1.7,
 
 
 class NeoHookean:
-    """W = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2 in the elements of a lattice (Bonet & Wood 2008, Eq. 6.27).
+    """W = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2 in the elements of a lattice (Bonet & Wood 2008, Eq.
+    6.27).
 
-    ``fixed`` (n,) marks nodes that cannot move; ``load_g`` (n,) [g] is added to the nodes' masses; ``serial`` runs on one core
-    (None: by the number of nodes). ``deformation`` (m + 1,) has the columns of each element's deformation gradient F as rows;
-    the last is for elements that do not exist.
+    ``fixed`` (n,) marks nodes that cannot move; ``load_g`` (n,) [g] is added to the nodes' masses; ``serial``
+    runs on one core (None: by the number of nodes). ``deformation`` (m + 1,) has the columns of each
+    element's deformation gradient F as rows; the last is for elements that do not exist.
     """
 
     EMBEDDING_CELL_RATIO: ClassVar[float] = 1.35
 
     @classmethod
     def make(cls, inputs: ModelInputs) -> "NeoHookean":
-        """Elements that fill the organ, with contact points on its surface where there are shapes. Raises SamplingError."""
+        """Elements that fill the organ, with contact points on its surface where there are shapes.
+
+        Raises SamplingError.
+        """
         tissue = inputs.tissue
         lattice = fill_with_cells(inputs.organ, tissue.cell_mm, [part.surface for part in inputs.parts])
         body = Body(lattice.nodes)
@@ -199,7 +206,8 @@ class NeoHookean:
     def set_material(
         self, young_kpa: float, poisson: float | None = None, parts: Sequence[Material] | None = None
     ) -> None:
-        """Change Young's modulus [kPa] of the tissue outside the parts, and the contacts' penalty stiffness with it.
+        """Change Young's modulus [kPa] of the tissue outside the parts, and the contacts' penalty stiffness
+        with it.
 
         Without a Poisson's ratio, or without parts, these stay the same; densities do so always.
         """
@@ -217,7 +225,8 @@ class NeoHookean:
     def remove_tissue(
         self, organ: trimesh.Trimesh, tissue: RemovedTissue | None, parts: Sequence[trimesh.Trimesh]
     ) -> None:
-        """Remove tissue from the whole organ at rest, or with None restore all of it. The state stays as it is.
+        """Remove tissue from the whole organ at rest, or with None restore all of it. The state stays as it
+        is.
 
         ``organ`` and ``parts`` are the surfaces that the model was made from [mm].
         """
@@ -254,7 +263,9 @@ class NeoHookean:
 
     @ti.func
     def begin(self, dt: float):
-        """The solver's prediction is the inertial target; start from the last positions and the rigid-body coarse correction."""
+        """The solver's prediction is the inertial target; start from the last positions and the rigid-body
+        coarse correction.
+        """
         for i in range(self.body.count):
             self.inertial_target[i] = self.body.predicted[i]
             self.body.predicted[i] = self.body.position[i]
@@ -294,8 +305,8 @@ class NeoHookean:
     def project(self, stiffness: float, relaxation_factor: float, dt: float):
         """One Gauss-Seidel iteration over all nodes; serial and colour by colour give the same result.
 
-        All ranges are known when the kernel compiles: this makes the code twice as fast, and on Vulkan any other range starts
-        65536 threads.
+        All ranges are known when the kernel compiles: this makes the code twice as fast, and on Vulkan any
+        other range starts 65536 threads.
         """
         if ti.static(self.serial):
             for i in range(self.body.count):
@@ -339,7 +350,9 @@ class NeoHookean:
 
     @ti.func
     def move(self, i, change):
-        """Move node i and update the deformation of the elements around it, which no other node of its colour has."""
+        """Move node i and update the deformation of the elements around it, which no other node of its
+        colour has.
+        """
         self.predicted[i] = self.predicted[i] + change
         for k in range(8):
             b = self.gradient[8 * i + k]
@@ -350,11 +363,11 @@ class NeoHookean:
 
     @ti.func
     def elastic(self, i):
-        """Force [uN] on node i of the elements around it, its negative derivative by the node's position (3, 3), and that
-        matrix's least eigenvalue.
+        """Force [uN] on node i of the elements around it, its negative derivative by the node's position (3,
+        3), and that matrix's least eigenvalue.
 
-        With B the node's gradient, f = -V (mu F B + (lambda ln J - mu) G / J), where G = dJ/dx = cof(F) B does not
-        depend on the node's own position, so that d^2J/dx^2 = 0.
+        With B the node's gradient, f = -V (mu F B + (lambda ln J - mu) G / J), where G = dJ/dx = cof(F) B
+        does not depend on the node's own position, so that d^2J/dx^2 = 0.
         """
         mu, lambda_ = self.mu, self.lambda_
         force = -mu * self.hourglass_gradient(i)
@@ -392,7 +405,9 @@ class NeoHookean:
 
     @ti.func
     def hourglass_gradient(self, i):
-        """Gradient by node i of the hourglass energy for a shear modulus of 1; zero for linear fields, so for rotations too."""
+        """Gradient by node i of the hourglass energy for a shear modulus of 1; zero for linear fields, so
+        for rotations too.
+        """
         x = self.predicted[i]
         gradient = tm.vec4(0.0)
         for k in range(27):
@@ -408,8 +423,8 @@ class NeoHookean:
 
     @ti.func
     def elastic_stress(self, c):
-        """Second Piola-Kirchhoff stress S = mu (1 - C^-1) + lambda ln J C^-1 of element c: 11, 22, 33, 12, 13, 23, relative to
-        the element's stiffness.
+        """Second Piola-Kirchhoff stress S = mu (1 - C^-1) + lambda ln J C^-1 of element c: 11, 22, 33, 12,
+        13, 23, relative to the element's stiffness.
         """
         mu, lambda_ = self.mu, self.lambda_
         if ti.static(self.has_parts):
@@ -453,7 +468,9 @@ def times(s, b):
 
 @ti.func
 def ln(x):
-    """Natural logarithm of a normal positive number to float32's rounding; unlike the library's it is inlined."""
+    """Natural logarithm of a normal positive number to float32's rounding; unlike the library's it is
+    inlined.
+    """
     bits = ti.bit_cast(x, ti.i32)
     exponent = (bits - SQRT_HALF_BITS) >> 23
     z = ti.bit_cast(bits - (exponent << 23), ti.f32)

@@ -1,4 +1,6 @@
-"""Contacts of particles with shapes and their Coulomb friction, found once a substep and never left violated."""
+"""Contacts of particles with shapes and their Coulomb friction, found once a substep and never left
+violated.
+"""
 
 import numpy as np
 import taichi as ti
@@ -15,7 +17,8 @@ PROJECTION_ITERATIONS = 8
 REACH_RADII = 2.0
 # Tolerance of distances [mm]: float32 positions of a body of 200 mm round to about 1e-5 mm.
 ROUNDING = 1e-4
-# A contact plane is exact within this distance of where it was found: a shape of 2 mm radius is ROUNDING off its plane there.
+# A contact plane is exact within this distance of where it was found: a shape of 2 mm radius is ROUNDING off
+# its plane there.
 EXACT_MM = 0.02
 SAFETY = 1e-3
 
@@ -23,12 +26,12 @@ SAFETY = 1e-3
 class ShapeContacts:
     """Contact planes of each particle with each shape, and the displacements by contact in this substep.
 
-    ``plane`` (n, shapes): normal and offset of the nearest surface, n . x = offset [mm]; that of a static shape is reused
-    while the particle is near to where it was ``found`` (n, shapes), a point and its distance [mm].
-    ``touched`` (n,): bits of the shapes that may be touched in this substep. ``push`` (n, shapes): displacement by friction
-    (x, y, z) and along the normal (w) so far [mm]. The clusters conserve momentum, so the sums of the displacements are
-    the impulses exchanged with the shape, and Coulomb's law applies to them: |friction| <= coefficient * normal. With
-    coefficient 0, ``push`` does not exist.
+    ``plane`` (n, shapes): normal and offset of the nearest surface, n . x = offset [mm]; that of a static
+    shape is reused while the particle is near to where it was ``found`` (n, shapes), a point and its distance
+    [mm]. ``touched`` (n,): bits of the shapes that may be touched in this substep. ``push`` (n, shapes):
+    displacement by friction (x, y, z) and along the normal (w) so far [mm]. The clusters conserve momentum,
+    so the sums of the displacements are the impulses exchanged with the shape, and Coulomb's law applies to
+    them: |friction| <= coefficient * normal. With coefficient 0, ``push`` does not exist.
     """
 
     def __init__(self, body: ParticleBody, shapes: list, friction: float) -> None:
@@ -63,7 +66,9 @@ class ShapeContacts:
 
     @ti.func
     def is_clear(self, s: ti.template(), i, p, distance):
-        """Whether particle i, at p, is farther than a distance from shape s, as far as a quick test can tell."""
+        """Whether particle i, at p, is farther than a distance from shape s, as far as a quick test can
+        tell.
+        """
         result = False
         if ti.static(self.shapes[s].moves):
             result = self.shapes[s].is_beyond(p, distance)
@@ -75,7 +80,9 @@ class ShapeContacts:
 
     @ti.func
     def nearest(self, s: ti.template(), i, p, reuse_mm: float):
-        """Normal and distance of shape s from particle i, at p, by the stored plane if it was found within ``reuse_mm``."""
+        """Normal and distance of shape s from particle i, at p, by the stored plane if it was found within
+        ``reuse_mm``.
+        """
         result = tm.vec4(0.0)
         if ti.static(self.shapes[s].moves):
             result = self.shapes[s].surface(p)
@@ -90,7 +97,9 @@ class ShapeContacts:
 
     @ti.func
     def find(self):
-        """Lines 6-9: the shapes that each particle's predicted position is near to; fast particles stop at the first on their path."""
+        """Lines 6-9: the shapes that each particle's predicted position is near to; fast particles stop at
+        the first on their path.
+        """
         for i in range(self.body.count):
             p = self.path_end(self.body.position[i], self.body.predicted[i])
             self.body.predicted[i] = p
@@ -111,7 +120,9 @@ class ShapeContacts:
 
     @ti.func
     def path_end(self, start, end):
-        """End of a particle's path; where a path longer than the radius meets a static shape, the point of impact."""
+        """End of a particle's path; where a path longer than the radius meets a static shape, the point of
+        impact.
+        """
         path, most = end - start, self.body.radius_mm
         if path.norm_sqr() > most * most:
             path *= self.time_of_impact.fraction(start, path, most)
@@ -126,7 +137,9 @@ class ShapeContacts:
 
     @ti.func
     def stabilise(self, iterations: int):
-        """Lines 10-15: move positions and predicted positions together out of shapes, which adds no velocity."""
+        """Lines 10-15: move positions and predicted positions together out of shapes, which adds no
+        velocity.
+        """
         for i in range(self.body.count):
             if self.touched[i] > 0:
                 x, moved = self.body.position[i], tm.vec3(0.0)
@@ -143,7 +156,9 @@ class ShapeContacts:
 
     @ti.func
     def pushed(self, i, x, relaxation_factor: float):
-        """Displacement [mm] of particle i, at x, by contact and friction, averaged over the shapes (lines 18-20)."""
+        """Displacement [mm] of particle i, at x, by contact and friction, averaged over the shapes (lines
+        18-20).
+        """
         touched, active = self.touched[i], 1
         if touched & (touched - 1) != 0:
             pushing = 0
@@ -172,10 +187,11 @@ class ShapeContacts:
 
     @ti.func
     def friction_change(self, s: ti.template(), i, x, normal, depth, factor):
-        """Displacement of particle i by friction on shape s, which displaces it by ``depth`` along the normal.
+        """Displacement of particle i by friction on shape s, which displaces it by ``depth`` along the
+        normal.
 
-        It opposes the tangential motion since the start of the substep, relative to the shape's motion (Macklin et al.
-        2014, Eq. 24), up to the coefficient times the total normal displacement.
+        It opposes the tangential motion since the start of the substep, relative to the shape's motion
+        (Macklin et al. 2014, Eq. 24), up to the coefficient times the total normal displacement.
         """
         push = self.push[i, s]
         normal_push = push.w + depth
@@ -192,8 +208,9 @@ class ShapeContacts:
     def finish(self):
         """End of a substep: project out of the shapes every particle that is still inside one.
 
-        Where the gap between shapes is too narrow for the contact radius, half of it, then the centre alone must be outside.
-        Where shapes overlap, so that each projects a particle into the other, it leaves through a free side of a tool.
+        Where the gap between shapes is too narrow for the contact radius, half of it, then the centre alone
+        must be outside. Where shapes overlap, so that each projects a particle into the other, it leaves
+        through a free side of a tool.
         """
         for i in range(self.body.count):
             self.body.predicted[i] = self.projected_out(i, self.body.predicted[i])
@@ -220,7 +237,9 @@ class ShapeContacts:
 
     @ti.func
     def projected_through_free_side(self, x):
-        """The nearest point outside one of a tool's half-spaces that is outside all shapes; x itself if there is none."""
+        """The nearest point outside one of a tool's half-spaces that is outside all shapes; x itself if
+        there is none.
+        """
         best, least = x, FAR
         if self.depth_inside(x) > ROUNDING:
             for s in ti.static(range(len(self.shapes))):

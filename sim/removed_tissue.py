@@ -1,4 +1,6 @@
-"""A lattice, its surface points and its membrane after a part of the tissue was cut out: the same nodes and cells, with less in them (NumPy)."""
+"""A lattice, its surface points and its membrane after a part of the tissue was cut out: the same nodes
+and cells, with less in them (NumPy).
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +22,8 @@ from sim.lattice import (
 )
 from sim.signed_distance import clipped_distance_grid
 
-# The spacing of points on the new surface grows by this factor until there are no more of them than were removed.
+# The spacing of points on the new surface grows by this factor until there are no more of them than were
+# removed.
 COARSER = 1.1
 # Rounding of points on the surface of what is removed.
 NEAR_MM = 0.1
@@ -28,8 +31,8 @@ NEAR_MM = 0.1
 
 @dataclass(frozen=True)
 class RemovedTissue:
-    """What is cut out of an organ at rest, and what remains, as closed surfaces [mm]; ``is_new`` (f,) marks the faces of ``remaining`` that
-    the cut has made.
+    """What is cut out of an organ at rest, and what remains, as closed surfaces [mm]; ``is_new`` (f,) marks
+    the faces of ``remaining`` that the cut has made.
     """
 
     removed: trimesh.Trimesh
@@ -57,9 +60,11 @@ class RemovedTissue:
 
 
 def lattice_without(lattice: Lattice, tissue: RemovedTissue, parts: Sequence[trimesh.Trimesh]) -> Lattice:
-    """The lattice without the removed tissue: cells that the cut crosses keep a part of their volume, others are as they were or empty.
+    """The lattice without the removed tissue: cells that the cut crosses keep a part of their volume, others
+    are as they were or empty.
 
-    Empty cells have neither volume nor gradients, and are at no position of ``index_of``. ``parts`` are those of the lattice.
+    Empty cells have neither volume nor gradients, and are at no position of ``index_of``. ``parts`` are those
+    of the lattice.
     """
     box = _box_around(lattice, tissue.removed)
     grid = np.argwhere(lattice.index_of[box] >= 0)
@@ -93,7 +98,9 @@ def _box_around(lattice: Lattice, surface: trimesh.Trimesh) -> tuple[slice, slic
 def _filled(
     lattice: Lattice, surface: trimesh.Trimesh, first: np.ndarray, shape: tuple[int, ...]
 ) -> np.ndarray:
-    """Fraction (x, y, z, s) inside a surface around each integration point of the cells from a position of the grid on."""
+    """Fraction (x, y, z, s) inside a surface around each integration point of the cells from a position of
+    the grid on.
+    """
     sample_mm = lattice.cell_mm / SAMPLES
     low = lattice.low_mm + lattice.cell_mm * first + sample_mm / 2
     x, y, z = (SAMPLES * count for count in shape)
@@ -126,7 +133,8 @@ def _fill_cells(lattice: Lattice, cells: np.ndarray, filled: np.ndarray) -> None
 def points_without(
     points: np.ndarray, area_mm2: np.ndarray, tissue: RemovedTissue, spacing_mm: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Surface points (p, 3) [mm] and areas (p,) [mm^2] after the cut, as many as before: those of removed tissue are on the new surface.
+    """Surface points (p, 3) [mm] and areas (p,) [mm^2] after the cut, as many as before: those of removed
+    tissue are on the new surface.
 
     Where that needs fewer points, the rest have no area.
     """
@@ -141,18 +149,23 @@ def points_without(
 
 
 def _few_points(surface: trimesh.Trimesh, spacing_mm: float, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """At most so many points (k, 3) [mm] on a surface, a spacing apart or more, and their areas (k,) [mm^2], which sum to the surface's."""
+    """At most so many points (k, 3) [mm] on a surface, a spacing apart or more, and their areas (k,)
+    [mm^2], which sum to the surface's.
+    """
     points, area = surface_points(surface, spacing_mm)
     while len(points) > most and spacing_mm < surface.extents.max():
         spacing_mm *= COARSER
         points, area = surface_points(surface, spacing_mm)
-    # Sides that face different directions have points of their own, however far apart points are: the largest stand for all.
+    # Sides that face different directions have points of their own, however far apart points are: the largest
+    # stand for all.
     largest = np.sort(np.argsort(-area, kind="stable")[:most])
     return points[largest], area[largest] * (area.sum() / area[largest].sum() if most else 0.0)
 
 
 def patch_shares(organ: trimesh.Trimesh, lattice: Lattice, tissue: RemovedTissue) -> np.ndarray:
-    """Share of the area of each patch (p,) of an organ's surface (``lattice.surface_patches``) that the cut leaves."""
+    """Share of the area of each patch (p,) of an organ's surface (``lattice.surface_patches``) that the
+    cut leaves.
+    """
     middle, area, *_, owner = faces_by_patch(organ, lattice.cell_mm, lattice.low_mm, lattice.index_of)
     left = area * ~tissue.is_removed(middle)
     return np.bincount(owner, left) / np.bincount(owner, area)

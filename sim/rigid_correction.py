@@ -1,7 +1,8 @@
-"""Rigid-body coarse correction: the rigid motion of the whole body, which Gauss-Seidel takes hundreds of iterations to find.
+"""Rigid-body coarse correction: the rigid motion of the whole body, which Gauss-Seidel takes hundreds of
+iterations to find.
 
-Newton's method with six unknowns minimises the energy of the time step over rigid motions of all nodes, under inertia,
-gravity and the contacts of the last substep. Elastic energy is invariant to them.
+Newton's method with six unknowns minimises the energy of the time step over rigid motions of all nodes, under
+inertia, gravity and the contacts of the last substep. Elastic energy is invariant to them.
 """
 
 from typing import Any
@@ -18,8 +19,8 @@ from sim.surface_contact import NEAR_MM, SurfaceContacts
 
 # Sums are made in blocks of this many terms, in an order that does not depend on threads.
 BLOCK = 64
-# Newton's method ends when a step moves no node by more than this [mm], or after this many steps. In parallel each step is
-# three kernels even when converged, so there are fewer.
+# Newton's method ends when a step moves no node by more than this [mm], or after this many steps. In parallel
+# each step is three kernels even when converged, so there are fewer.
 CONVERGED_MM = 1e-4
 NEWTON_STEPS = 12
 NEWTON_STEPS_IN_PARALLEL = 3
@@ -33,8 +34,8 @@ MOST_ROTATION = 0.5
 Sums = ti.types.struct(
     force=tm.vec3, torque=tm.vec3, translational=tm.mat3, mixed=tm.mat3, rotational=tm.mat3
 )
-# Of nodes at an arm a from the centre, held to a shift d from there with a stiffness w: sums of w, w a, w d, w a a^T and w d a^T; and the
-# force and torque that give the nodes their velocities.
+# Of nodes at an arm a from the centre, held to a shift d from there with a stiffness w: sums of w, w a, w d,
+# w a a^T and w d a^T; and the force and torque that give the nodes their velocities.
 Moments = ti.types.struct(
     stiffness=ti.f32,
     arm=tm.vec3,
@@ -110,11 +111,11 @@ def no_moments():
 
 
 class RigidCorrection:
-    """Moves a body's predicted positions rigidly towards ``inertial_target`` (n,) [mm], weighted with ``mass`` (n,) [g],
-    and to the places at rest to which a ``tether`` (n,) [g/s^2] holds.
+    """Moves a body's predicted positions rigidly towards ``inertial_target`` (n,) [mm], weighted with
+    ``mass`` (n,) [g], and to the places at rest to which a ``tether`` (n,) [g/s^2] holds.
 
-    The unknowns are the translation and the rotation vector about the node ``centre``. The nodes' forces depend on them by sums that are
-    made once; the contacts' forces are summed in each Newton step.
+    The unknowns are the translation and the rotation vector about the node ``centre``. The nodes' forces
+    depend on them by sums that are made once; the contacts' forces are summed in each Newton step.
     """
 
     def __init__(
@@ -150,7 +151,9 @@ class RigidCorrection:
 
     @function
     def move(self, dt: float):
-        """Move all predicted positions by the rigid part of their velocities, corrected by Newton steps, up to the time of impact."""
+        """Move all predicted positions by the rigid part of their velocities, corrected by Newton steps,
+        up to the time of impact.
+        """
         for block in range(self.blocks):
             self.sum_nodes(block, dt)
         for _ in range(1):
@@ -229,7 +232,9 @@ class RigidCorrection:
 
     @ti.func
     def newton_step(self, has_forces):
-        """One step; the first, without forces, takes the rigid part of the velocities and ignores the contacts' forces."""
+        """One step; the first, without forces, takes the rigid part of the velocities and ignores the
+        contacts' forces.
+        """
         if ti.static(self.has_contacts):
             for block in range(self.contact_blocks):
                 self.sum_contacts(block, has_forces)
@@ -238,7 +243,9 @@ class RigidCorrection:
 
     @ti.func
     def node_sums(self, has_forces):
-        """Forces of the nodes, and their derivatives: a node at R a is pulled towards a + d, both relative to the moved centre."""
+        """Forces of the nodes, and their derivatives: a node at R a is pulled towards a + d, both relative
+        to the moved centre.
+        """
         of, rotation, translation = self.total_moments.of(0), self.rotation[None], self.translation[None]
         arm = rotation @ of.arm
         arm_arm = rotation @ of.arm_arm @ rotation.transpose()

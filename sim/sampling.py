@@ -1,8 +1,9 @@
-"""Sampling of particles in a closed surface, and of overlapping clusters of the particles (NumPy, at build time).
+"""Sampling of particles in a closed surface, and of overlapping clusters of the particles (NumPy, at build
+time).
 
-The paper's greedy method (Camara et al. 2016, "Collision and data preparation"): samples at the voxels of a fine
-voxelisation, optionally also on the surface; then one particle at a time, each removing the samples nearer than the radius.
-The clusters are chosen among the particles in the same way.
+The paper's greedy method (Camara et al. 2016, "Collision and data preparation"): samples at the voxels of a
+fine voxelisation, optionally also on the surface; then one particle at a time, each removing the samples
+nearer than the radius. The clusters are chosen among the particles in the same way.
 """
 
 from collections.abc import Iterator
@@ -30,8 +31,8 @@ class SamplingError(UserError):
 class RestBody:
     """A body of particles at rest.
 
-    particles (n, 3) float64 [mm], in the frame of the surface, all of one mass; contact_radius (n,) [mm]: smallest allowed
-    distance of a particle's centre from a shape.
+    particles (n, 3) float64 [mm], in the frame of the surface, all of one mass; contact_radius (n,) [mm]:
+    smallest allowed distance of a particle's centre from a shape.
     """
 
     particles: np.ndarray
@@ -41,11 +42,12 @@ class RestBody:
 
 @dataclass(frozen=True)
 class Patches:
-    """Groups of particles that are in the same clusters: one affine map moves all particles of a patch to their goals.
+    """Groups of particles that are in the same clusters: one affine map moves all particles of a patch to
+    their goals.
 
-    Particles ``start[p]`` to ``start[p + 1]`` of a body are patch p; row p of ``clusters`` lists the clusters it is in.
-    The ``multi_count`` first patches have more than one particle, the others one. In a kidney, patches have 2.5 times fewer
-    memberships in clusters than particles have.
+    Particles ``start[p]`` to ``start[p + 1]`` of a body are patch p; row p of ``clusters`` lists the clusters
+    it is in. The ``multi_count`` first patches have more than one particle, the others one. In a kidney,
+    patches have 2.5 times fewer memberships in clusters than particles have.
     """
 
     start: np.ndarray
@@ -80,12 +82,13 @@ def fill_body(
     volume_sampling: float = 4.0,
     surface_samples_per_mm2: float = 0.0,
 ) -> RestBody:
-    """Particles that fill a closed surface [mm], no two nearer than ``radius_mm``, along a space-filling curve.
+    """Particles that fill a closed surface [mm], no two nearer than ``radius_mm``, along a space-filling
+    curve.
 
-    The voxels are ``radius_mm / volume_sampling`` wide. Samples on the surface come before those inside, so that thin parts keep
-    their boundary. A particle touches a shape where the surface above it does: its contact radius is its depth under the surface, at
-    most the particle radius. So a body in a mould of its own shape is at rest. Raises SamplingError when nothing fits, or when
-    there is not enough memory.
+    The voxels are ``radius_mm / volume_sampling`` wide. Samples on the surface come before those inside, so
+    that thin parts keep their boundary. A particle touches a shape where the surface above it does: its
+    contact radius is its depth under the surface, at most the particle radius. So a body in a mould of its
+    own shape is at rest. Raises SamplingError when nothing fits, or when there is not enough memory.
     """
     vertices, faces = surface.vertices, surface.faces
     pitch = radius_mm / volume_sampling
@@ -106,10 +109,11 @@ def fill_body(
 
 
 def sample_clusters(particles: np.ndarray, spacing_mm: float) -> csr_array:
-    """Clusters of the particles (n, 3) [mm]: centres greedily chosen ``spacing_mm`` apart, members within it (as in FleX).
+    """Clusters of the particles (n, 3) [mm]: centres greedily chosen ``spacing_mm`` apart, members within it
+    (as in FleX).
 
-    Row c has the particles of cluster c, ascending. The greedy choice leaves no particle farther than the spacing from a centre, so
-    the clusters cover the body and overlap.
+    Row c has the particles of cluster c, ascending. The greedy choice leaves no particle farther than the
+    spacing from a centre, so the clusters cover the body and overlap.
     """
     rows = [near for _, near in _greedy(particles, spacing_mm)]
     members = np.concatenate(rows)
@@ -118,10 +122,11 @@ def sample_clusters(particles: np.ndarray, spacing_mm: float) -> csr_array:
 
 
 def group_into_patches(rest: RestBody, cluster_spacing: float) -> tuple[RestBody, Patches]:
-    """The body with its particles sorted by patch, and the patches of its clusters, ``cluster_spacing`` radii apart.
+    """The body with its particles sorted by patch, and the patches of its clusters, ``cluster_spacing`` radii
+    apart.
 
-    Patches with several particles come first; otherwise they keep the order of their first particles, so that neighbours
-    in space stay neighbours in memory.
+    Patches with several particles come first; otherwise they keep the order of their first particles, so that
+    neighbours in space stay neighbours in memory.
     """
     rows = sample_clusters(rest.particles, cluster_spacing * rest.radius_mm).T.tocsr()
     number: dict[bytes, int] = {}
@@ -142,7 +147,8 @@ def check_memory(needed_bytes: float, what: str, advice: str) -> None:
     free = psutil.virtual_memory().available
     if needed_bytes > free:
         raise SamplingError(
-            f"{what} need {needed_bytes / 1e9:.1f} GB in this organ, and {free / 1e9:.1f} GB are free: {advice}"
+            f"{what} need {needed_bytes / 1e9:.1f} GB in this organ, and {free / 1e9:.1f} GB are free: "
+            f"{advice}"
         )
 
 
@@ -159,7 +165,9 @@ def occupied_voxels(vertices: np.ndarray, faces: np.ndarray, pitch: float) -> tu
 
 
 def morton_codes(points: np.ndarray, cell_mm: float) -> np.ndarray:
-    """Morton codes (n,) of points (n, 3) [mm]: sorted by them, neighbours in space are neighbours in memory."""
+    """Morton codes (n,) of points (n, 3) [mm]: sorted by them, neighbours in space are neighbours in
+    memory.
+    """
     cells = ((points - points.min(axis=0)) / cell_mm).astype(np.uint64)
     code = np.zeros(len(points), np.uint64)
     for bit in range(16):
@@ -206,7 +214,9 @@ def _surface_particles(
 
 
 def _greedy(points: np.ndarray, spacing_mm: float) -> Iterator[tuple[int, np.ndarray]]:
-    """Points chosen in their order, none within the spacing of an earlier one, and all points within it, ascending."""
+    """Points chosen in their order, none within the spacing of an earlier one, and all points within it,
+    ascending.
+    """
     tree, free = cKDTree(points), np.ones(len(points), bool)
     for i in range(len(points)):
         if free[i]:

@@ -12,10 +12,11 @@ CELLS = 1 << 15
 
 
 class SelfContacts:
-    """Keeps pairs of particles that share no cluster at least one particle radius apart, their distance in the sampling.
+    """Keeps pairs of particles that share no cluster at least one particle radius apart, their distance in
+    the sampling.
 
-    Cells of a hashed grid have lists of particles. The neighbours of each particle are sorted, so that sums do not depend
-    on the order in which threads filled a list.
+    Cells of a hashed grid have lists of particles. The neighbours of each particle are sorted, so that sums
+    do not depend on the order in which threads filled a list.
     """
 
     def __init__(self, model: ShapeMatching, friction: float) -> None:
@@ -93,7 +94,8 @@ class SelfContacts:
             for k in range(self.cell_start[c], self.cell_start[c + 1]):
                 j = self.sorted[k]
                 q = self.body.predicted[j]
-                # Two cells of the neighbourhood may have the same hash: a particle counts only in its own cell.
+                # Two cells of the neighbourhood may have the same hash: a particle counts only in its own
+                # cell.
                 if j != i and (self.cell_of(q) == cell).all() and (p - q).norm() < self.reach:
                     if self.share_cluster(i, j) == 0:
                         count = self.insert(i, j, count)
@@ -153,7 +155,9 @@ class SelfContacts:
 
     @ti.func
     def direction(self, i, j, away, gap):
-        """Unit vector from j to i; of two particles at the same point the one with the higher index moves up."""
+        """Unit vector from j to i; of two particles at the same point the one with the higher index moves
+        up.
+        """
         normal = tm.vec3(0.0, 0.0, 1.0 if i > j else -1.0)
         if gap > 1e-6:
             normal = away / gap

@@ -1,7 +1,9 @@
-"""The paper's tissue model: position-based dynamics with clustered shape matching (Eqs. 8-12; Mueller et al. 2005).
+"""The paper's tissue model: position-based dynamics with clustered shape matching (Eqs. 8-12; Mueller et al.
+2005).
 
-The clusters overlap, and each is matched rigidly to its rest shape. The model computes on patches, groups of particles that
-are in the same clusters: a cluster's moments are sums of its patches' moments, and one averaged frame moves a whole patch.
+The clusters overlap, and each is matched rigidly to its rest shape. The model computes on patches, groups of
+particles that are in the same clusters: a cluster's moments are sums of its patches' moments, and one
+averaged frame moves a whole patch.
 """
 
 from typing import Any, ClassVar
@@ -29,23 +31,26 @@ PARALLEL_PARTICLES = 100_000
 class ShapeMatching:
     """Clusters of a body's particles and their current frames.
 
-    ``relaxation`` is how a particle's goals are combined (Eq. 7): ``local`` divides by the number of clusters that the
-    particle is in, ``global`` by the largest such number of all particles. Both conserve linear and angular momentum, by the
-    masses with which the clusters are fitted: under ``local`` a particle in n clusters counts with 1/n of its mass in each,
-    under ``global`` with its whole mass.
+    ``relaxation`` is how a particle's goals are combined (Eq. 7): ``local`` divides by the number of clusters
+    that the particle is in, ``global`` by the largest such number of all particles. Both conserve linear and
+    angular momentum, by the masses with which the clusters are fitted: under ``local`` a particle in n
+    clusters counts with 1/n of its mass in each, under ``global`` with its whole mass.
 
-    Of each patch: ``patch_rest``, its centre [mm] and mass, in units of a particle's, at rest; ``centre`` now; ``moment``,
-    rows that are the columns of the sum of m (x - centre) (x0 - centre0)^T; ``goal``, as ``frame``, the sum over its
-    clusters. Of each cluster: ``cluster_rest``; ``frame``, rows that are the columns of the rotation R, then the
-    translation T [mm] of x = R x0 + T. ``local`` (n,) are the particles' rest positions relative to their patches' centres,
-    with 1 as the fourth entry.
+    Of each patch: ``patch_rest``, its centre [mm] and mass, in units of a particle's, at rest; ``centre``
+    now; ``moment``, rows that are the columns of the sum of m (x - centre) (x0 - centre0)^T; ``goal``, as
+    ``frame``, the sum over its clusters. Of each cluster: ``cluster_rest``; ``frame``, rows that are the
+    columns of the rotation R, then the translation T [mm] of x = R x0 + T. ``local`` (n,) are the particles'
+    rest positions relative to their patches' centres, with 1 as the fourth entry.
     """
 
     EMBEDDING_CELL_RATIO: ClassVar[float] = 2.0
 
     @classmethod
     def make(cls, inputs: ModelInputs) -> "ShapeMatching":
-        """Clusters of the particles that fill the organ; the organ may already be a RestBody. Raises SamplingError."""
+        """Clusters of the particles that fill the organ; the organ may already be a RestBody.
+
+        Raises SamplingError.
+        """
         rest = inputs.organ if isinstance(inputs.organ, RestBody) else fill_organ(inputs.organ, inputs.tissue)
         sorted_rest, patches = group_into_patches(rest, inputs.tissue.cluster_spacing)
         body = ParticleBody(sorted_rest, inputs.mass_scaling_per_mm)
@@ -103,7 +108,8 @@ class ShapeMatching:
 
     def _store_rest(self, patches: Patches) -> None:
         shared, sizes = patches.cluster_counts, patches.sizes
-        # Global relaxation divides by the largest number of goals; the goals that a particle lacks are no displacement.
+        # Global relaxation divides by the largest number of goals; the goals that a particle lacks are no
+        # displacement.
         share, goals = 1.0 / shared, shared
         if self.relaxation == "global":
             share, goals = np.ones(len(shared)), np.full(len(shared), shared.max())
@@ -209,8 +215,8 @@ class ShapeMatching:
 
     @ti.func
     def moment_of(self, k, at, moved):
-        """Contribution of particle k, ``local`` at a place and displaced by ``moved``, to its patch's moment (rows: columns of the moment) and
-        sum (last row).
+        """Contribution of particle k, ``local`` at a place and displaced by ``moved``, to its patch's moment
+        (rows: columns of the moment) and sum (last row).
         """
         if ti.static(self.body.mass_scaled):
             moved *= self.body.mass_scale[k]
@@ -218,7 +224,9 @@ class ShapeMatching:
 
     @ti.func
     def add_moment(self, p, centre, moment, sums):
-        """Centre and moment of patch p from sums over its particles' displacements, which keeps digits in float32."""
+        """Centre and moment of patch p from sums over its particles' displacements, which keeps digits in
+        float32.
+        """
         scale, total = self.patch_scale[p], row(sums, 3)
         if ti.static(self.body.mass_scaled):
             sums -= (self.patch_rest[p] - self.patch_centre[p]).outer_product(total)
@@ -229,7 +237,8 @@ class ShapeMatching:
     def fit(self, from_scratch: ti.template()):
         """Least-squares rigid frames of the clusters (Eq. 8), from their last rotations or from scratch.
 
-        A loop for the sums, whose lengths differ, and one for the rotations, so that the second is vectorised.
+        A loop for the sums, whose lengths differ, and one for the rotations, so that the second is
+        vectorised.
         """
         for c in range(self.count):
             first, last = self.member_start[c], self.member_start[c + 1]
@@ -265,13 +274,17 @@ class ShapeMatching:
 
     @ti.func
     def apart(self, p, centre0, reference):
-        """Offset of patch p's centre from a cluster's at rest, and its offset from a reference now, times its mass."""
+        """Offset of patch p's centre from a cluster's at rest, and its offset from a reference now, times
+        its mass.
+        """
         rest = self.patch_rest[p]
         return rest - centre0, rest.w * (self.centre[p] - reference)
 
     @function
     def average(self):
-        """Averaged frame of each patch's clusters: the mean of R_c x0 + T_c is (mean R_c) x0 + mean T_c (Eq. 7)."""
+        """Averaged frame of each patch's clusters: the mean of R_c x0 + T_c is (mean R_c) x0 + mean T_c
+        (Eq. 7).
+        """
         for p in range(self.patch_count):
             frame = tm.mat4(0.0)
             for k in range(self.cluster_start[p], self.cluster_start[p + 1]):
@@ -282,7 +295,9 @@ class ShapeMatching:
 
     @function
     def move_to_goals(self, step: float):
-        """Move each predicted position by ``step`` times the averaged displacement to its goals (Eqs. 9 and 12)."""
+        """Move each predicted position by ``step`` times the averaged displacement to its goals (Eqs. 9
+        and 12).
+        """
         for p in range(self.multi_count):
             keep = 1.0 - step * self.patch_scale[p].w
             frame = step * self.goal[p]

@@ -1,9 +1,11 @@
-"""Rigid shapes for contact: planes, signed distance fields, convex tools; and the time of impact with static shapes.
+"""Rigid shapes for contact: planes, signed distance fields, convex tools; and the time of impact with static
+shapes.
 
-Every shape has ``surface(p)``: outward unit normal (x, y, z) and signed distance (w) [mm] of the nearest surface, negative
-inside and ``FAR`` out of reach; ``motion(p)``: displacement of its material at p in this substep [mm]; ``is_beyond(p,
-distance)``: whether a quick test finds p farther away than a distance [mm]; and ``moves``: whether it can move. StaticShape shapes
-also have ``clearance(p)``: a lower bound of the distance [mm] of the surface from p at any distance, negative inside.
+Every shape has ``surface(p)``: outward unit normal (x, y, z) and signed distance (w) [mm] of the nearest
+surface, negative inside and ``FAR`` out of reach; ``motion(p)``: displacement of its material at p in this
+substep [mm]; ``is_beyond(p, distance)``: whether a quick test finds p farther away than a distance [mm]; and
+``moves``: whether it can move. StaticShape shapes also have ``clearance(p)``: a lower bound of the distance
+[mm] of the surface from p at any distance, negative inside.
 """
 
 from itertools import combinations
@@ -132,8 +134,8 @@ def interpolated(ends, t):
 class ConvexTool:
     """A rigid tool that moves: the intersection of half-spaces normal . x <= offset in its own frame.
 
-    ``normals`` (k, 3) unit, ``offsets_mm`` (k,). With an edge radius, it is the union of all balls of this radius inside
-    the half-spaces: edges and corners are rounded.
+    ``normals`` (k, 3) unit, ``offsets_mm`` (k,). With an edge radius, it is the union of all balls of this
+    radius inside the half-spaces: edges and corners are rounded.
     """
 
     moves = True
@@ -163,7 +165,8 @@ class ConvexTool:
         return ConvexTool(np.concatenate([np.eye(3), -np.eye(3)]), offsets, edge_radius_mm)
 
     def follow(self, poses: np.ndarray) -> None:
-        """Set the poses (substeps + 1, 4, 4), world from tool [mm], at the start of a time step and at the end of each substep.
+        """Set the poses (substeps + 1, 4, 4), world from tool [mm], at the start of a time step and at the
+        end of each substep.
 
         Raises ValueError for more than MOST_SUBSTEPS substeps and for poses that are not finite.
         """
@@ -227,7 +230,8 @@ class ConvexTool:
             d = plane.xyz.dot(local) - plane.w
             if d > depth:
                 depth, normal = d, plane.xyz
-            # One projection on each half-space gives the nearest point of a cuboid, and of any tool near its faces.
+            # One projection on each half-space gives the nearest point of a cuboid, and of any tool near its
+            # faces.
             nearest -= ti.max(plane.xyz.dot(nearest) - plane.w, 0.0) * plane.xyz
         outward = local - nearest
         distance = outward.norm()
@@ -250,7 +254,9 @@ class TimeOfImpact:
 
     @ti.func
     def fraction(self, start, path, free: float):
-        """Fraction of a path [mm] from a start up to the first shape; 1 for paths not longer than ``free`` [mm]."""
+        """Fraction of a path [mm] from a start up to the first shape; 1 for paths not longer than ``free``
+        [mm].
+        """
         length = path.norm()
         fraction = 1.0
         if length > free:
@@ -272,7 +278,9 @@ class TimeOfImpact:
 
 
 def _farthest_vertex(half_spaces: np.ndarray) -> float:
-    """Distance [mm] from the origin of the farthest vertex of an intersection of half-spaces (k, 4), normal and offset."""
+    """Distance [mm] from the origin of the farthest vertex of an intersection of half-spaces (k, 4),
+    normal and offset.
+    """
     triples = np.array(list(combinations(half_spaces, 3)))
     crossing = triples[np.abs(np.linalg.det(triples[:, :, :3])) > 1e-9]
     vertex = np.linalg.solve(crossing[:, :, :3], crossing[:, :, 3:])[:, :, 0]

@@ -1,4 +1,6 @@
-"""Signed distances to a closed surface, at build time: of points, and of a regular grid (for which Taichi must be started)."""
+"""Signed distances to a closed surface, at build time: of points, and of a regular grid (for which Taichi
+must be started).
+"""
 
 import igl
 import numpy as np
@@ -9,7 +11,8 @@ from scipy.ndimage import label
 from sim.device import backend
 from sim.stored_arrays import stored
 
-# Grid points nearer to the surface than EXACT_MM get exact distances, the others are interpolated from every third point.
+# Grid points nearer to the surface than EXACT_MM get exact distances, the others are interpolated from every
+# third point.
 COARSENESS, EXACT_MM = 3, 5.0
 # A little more than half of the spacing.
 NEAR_CELLS = 0.51
@@ -21,7 +24,8 @@ def signed_distance(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Distances (n,) [mm] of points (n, 3), negative inside, and the nearest faces (n,) of a closed surface.
 
-    Nearest triangles and winding numbers are two calls: libigl's one call with pseudonormals takes four times as long.
+    Nearest triangles and winding numbers are two calls: libigl's one call with pseudonormals takes four times
+    as long.
     """
     vertices = np.ascontiguousarray(vertices, np.float64)
     faces = np.ascontiguousarray(faces, np.int64)
@@ -34,11 +38,12 @@ def signed_distance(
 def distance_grid(
     vertices: np.ndarray, faces: np.ndarray, spacing_mm: float, reach_mm: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distances (nx, ny, nz) [mm] to a closed surface on a grid that extends ``reach_mm`` around it, and its origin (3,).
+    """Signed distances (nx, ny, nz) [mm] to a closed surface on a grid that extends ``reach_mm`` around it,
+    and its origin (3,).
 
-    Exact near the surface; farther away interpolated in a coarser grid, with an error of half its spacing at most. The sign
-    is from winding numbers, which are robust to folds and slivers: point by point near the surface, one for each region
-    that it separates.
+    Exact near the surface; farther away interpolated in a coarser grid, with an error of half its spacing at
+    most. The sign is from winding numbers, which are robust to folds and slivers: point by point near the
+    surface, one for each region that it separates.
     """
     vertices, faces = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
     distance, low = stored(_distances, vertices, faces, float(spacing_mm), float(reach_mm), backend=backend())
@@ -65,8 +70,8 @@ def clipped_distance_grid(
     spacing_mm: float,
     within_mm: float,
 ) -> np.ndarray:
-    """Signed distances (nx, ny, nz) [mm] to a closed surface on a grid with its first point at ``low`` (3,): exact to float32 up to
-    ``within_mm``, which is at least the spacing, and beyond it that with the sign.
+    """Signed distances (nx, ny, nz) [mm] to a closed surface on a grid with its first point at ``low`` (3,):
+    exact to float32 up to ``within_mm``, which is at least the spacing, and beyond it that with the sign.
     """
     vertices, faces = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
     size = np.array(shape)
@@ -96,7 +101,9 @@ def _signs(
     spacing_mm: float,
     distance: np.ndarray,
 ) -> np.ndarray:
-    """-1 (n,) for a grid's points inside a surface, 1 for those outside; ``distance`` (n,) [mm] is how far they are from it."""
+    """-1 (n,) for a grid's points inside a surface, 1 for those outside; ``distance`` (n,) [mm] is how far
+    they are from it.
+    """
     # Neighbours that are both farther from the surface than half their distance are on the same side of it.
     near = distance <= NEAR_CELLS * spacing_mm
     region = label(~near.reshape(shape))[0].ravel()
@@ -112,7 +119,9 @@ def _signs(
 def _coarse_distances(
     vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, shape: np.ndarray, spacing_mm: float
 ) -> np.ndarray:
-    """Distances (n,) [mm] of a grid's points, interpolated linearly between those of every third along each axis."""
+    """Distances (n,) [mm] of a grid's points, interpolated linearly between those of every third along
+    each axis.
+    """
     coarse = -(-(shape - 1) // COARSENESS) + 1
     points = low + COARSENESS * spacing_mm * np.indices(tuple(coarse)).reshape(3, -1).T
     known = np.sqrt(igl.point_mesh_squared_distance(points, vertices, faces)[0]).reshape(coarse)
@@ -131,7 +140,9 @@ def _squares_near(
     within_mm: ti.f32,
     squared: ti.types.ndarray(ndim=3),
 ):
-    """Squared distances [mm^2] of a grid's points from triangles with corners (n, 3) [cells], where nearer than ``within_mm``."""
+    """Squared distances [mm^2] of a grid's points from triangles with corners (n, 3) [cells], where nearer
+    than ``within_mm``.
+    """
     for face in range(corners.shape[0]):
         a, b, c = corners[face, 0], corners[face, 1], corners[face, 2]
         margin = within_mm / spacing_mm

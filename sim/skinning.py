@@ -1,7 +1,8 @@
 """Skinning: points that move with a tissue, such as surfaces, beads and the vertices of the embedding.
 
-An ``Interpolation`` is a value: it says which carriers a point at rest is attached to, by which weights. A ``Carrier`` has their present
-positions in fields; it needs no solver, so that a process that only draws can have one too.
+An ``Interpolation`` is a value: it says which carriers a point at rest is attached to, by which weights. A
+``Carrier`` has their present positions in fields; it needs no solver, so that a process that only draws can
+have one too.
 """
 
 from dataclasses import dataclass
@@ -48,12 +49,16 @@ class Carrier(Protocol):
         ...
 
     def carried(self, point: ti.Vector, frame: ti.Vector, weight: ti.Vector) -> ti.Vector:
-        """The present position (3,) [mm] of an attached point, from its rest position, carriers (k,) and weights (k,); a ti.func."""
+        """The present position (3,) [mm] of an attached point, from its rest position, carriers (k,) and
+        weights (k,); a ti.func.
+        """
         ...
 
 
 class NodeCarrier:
-    """Nodes of a lattice, by whose weighted displacements points move; ``position`` and ``rest`` are fields (n,)."""
+    """Nodes of a lattice, by whose weighted displacements points move; ``position`` and ``rest`` are
+    fields (n,).
+    """
 
     def __init__(self, interpolation: Interpolation, position: Field, rest: Field) -> None:
         self.interpolation, self.position, self.rest = interpolation, position, rest
@@ -76,8 +81,8 @@ class NodeCarrier:
 
 
 class ClusterCarrier:
-    """Clusters of particles, by whose weighted frames points move (weighted matrix blending); ``frame`` (k,) has the columns of rotation and
-    translation as its rows.
+    """Clusters of particles, by whose weighted frames points move (weighted matrix blending); ``frame`` (k,)
+    has the columns of rotation and translation as its rows.
     """
 
     def __init__(self, interpolation: Interpolation, frame: Field) -> None:
@@ -128,8 +133,8 @@ class ClusterInterpolation:
 class Skin:
     """Points (n, 3) [mm] attached to a carrier (the paper's "skinning").
 
-    They move as the tissue at ``at`` (n, 3) does, by default the tissue where they are. ``vertices`` (n,): positions [mm] at
-    the last ``update``.
+    They move as the tissue at ``at`` (n, 3) does, by default the tissue where they are. ``vertices`` (n,):
+    positions [mm] at the last ``update``.
     """
 
     def __init__(self, carrier: Carrier, points: np.ndarray, at: np.ndarray | None = None) -> None:

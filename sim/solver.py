@@ -25,8 +25,9 @@ MOST_EXPONENT = 30.0
 class StepSettings:
     """Settings of a step; the defaults are the paper's Table 1, except the stiffness, which it does not give.
 
-    ``stiffness`` is alpha of Eq. 12, ``relaxation_factor`` is w of Eq. 7 (successive over-relaxation), ``gravity`` (3,) is in
-    mm/s^2, ``damping`` [1/s] is the rate at which velocities decay. Raises ValueError for a value out of range.
+    ``stiffness`` is alpha of Eq. 12, ``relaxation_factor`` is w of Eq. 7 (successive over-relaxation),
+    ``gravity`` (3,) is in mm/s^2, ``damping`` [1/s] is the rate at which velocities decay. Raises ValueError
+    for a value out of range.
     """
 
     stiffness: float = Field(default=0.95, ge=0, le=1)
@@ -48,7 +49,8 @@ class SolverState:
 
 
 class Solver:
-    """Steps one body with its tissue model and contacts with shapes, and optionally self-contact and a moving tool.
+    """Steps one body with its tissue model and contacts with shapes, and optionally self-contact and a moving
+    tool.
 
     For what is None no kernel is compiled and no memory taken.
     """
@@ -74,9 +76,9 @@ class Solver:
     def step(self, settings: StepSettings, tool_poses: np.ndarray | None = None) -> None:
         """Advance by one time step.
 
-        ``tool_poses`` (substeps + 1, 4, 4), world from tool [mm], are the tool's poses at the start of the step and at the
-        end of each substep; without them the tool does not move. Raises ValueError for poses that are not finite, before anything
-        has moved.
+        ``tool_poses`` (substeps + 1, 4, 4), world from tool [mm], are the tool's poses at the start of the
+        step and at the end of each substep; without them the tool does not move. Raises ValueError for poses
+        that are not finite, before anything has moved.
         """
         dt = settings.time_step_s / settings.substeps
         if self.tool is not None:
@@ -132,7 +134,9 @@ class Solver:
         damping: float,
         stabilisation_iterations: int,
     ):
-        """The start of a substep: on one core for bodies so small that starting threads takes longer than they save, as the kernels below."""
+        """The start of a substep: on one core for bodies so small that starting threads takes longer than
+        they save, as the kernels below.
+        """
         gravity = tm.vec3(gravity_x, gravity_y, gravity_z)
         if ti.static(self.serial):
             ti.loop_config(serialize=True)
@@ -143,7 +147,9 @@ class Solver:
 
     @kernel
     def iterate(self, iterations: int, stiffness: float, relaxation_factor: float, dt: float):
-        """All iterations of a substep on one core, or the next one on all cores: only outermost loops run in parallel."""
+        """All iterations of a substep on one core, or the next one on all cores: only outermost loops run
+        in parallel.
+        """
         if ti.static(self.serial):
             ti.loop_config(serialize=True)
             for iteration in range(iterations):
@@ -163,7 +169,9 @@ class Solver:
 
     @ti.func
     def start(self, substep, dt: float, gravity: tm.vec3, damping: float, stabilisation_iterations: int):
-        """Lines 1-15: prediction, search for contacts, and stabilisation of contacts violated at the start."""
+        """Lines 1-15: prediction, search for contacts, and stabilisation of contacts violated at the
+        start.
+        """
         if ti.static(self.has_tool):
             for _ in range(1):
                 self.tool.start_substep(substep)
@@ -219,5 +227,7 @@ class Solver:
 
 @ti.pyfunc
 def relaxation_at(iteration: int, iterations: int, relaxation_factor: float) -> float:
-    """Relaxation factor of an iteration, 1 in the last: line 24 would turn its overshoot into velocity, which would grow."""
+    """Relaxation factor of an iteration, 1 in the last: line 24 would turn its overshoot into velocity,
+    which would grow.
+    """
     return relaxation_factor if iteration < iterations - 1 else 1.0

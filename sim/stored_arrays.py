@@ -1,6 +1,8 @@
-"""Arrays that are computed once from the same inputs and then read from files, so that a rehearsal starts sooner.
+"""Arrays that are computed once from the same inputs and then read from files, so that a rehearsal starts
+sooner.
 
-A file's name is a hash of the inputs, of the sources and of the libraries: it contains arrays alone, and no name of a patient or a file.
+A file's name is a hash of the inputs, of the sources and of the libraries: it contains arrays alone, and no
+name of a patient or a file.
 """
 
 import functools
@@ -33,8 +35,9 @@ DAMAGED = (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile
 def stored(compute: Callable[..., Arrays], *arguments: object, backend: str = "") -> Arrays:
     """The arrays ``compute(*arguments)``, from a file where there is one: the same bits, in C order.
 
-    ``arguments`` are arrays, closed surfaces, numbers, texts; ``backend`` names Taichi's, where the bits depend on it. A file
-    that is damaged or cannot be written is no error. Raises TypeError for other arguments, and what ``compute`` raises.
+    ``arguments`` are arrays, closed surfaces, numbers, texts; ``backend`` names Taichi's, where the bits
+    depend on it. A file that is damaged or cannot be written is no error. Raises TypeError for other
+    arguments, and what ``compute`` raises.
     """
     if FOLDER is None:
         return _in_order(compute(*arguments))
@@ -101,7 +104,10 @@ def _write(file: Path, arrays: Arrays) -> None:
 
 
 def _remove_oldest(folder: Path) -> None:
-    """Remove the files used least recently beyond MOST_BYTES, also what runs that were killed have left. Raises OSError."""
+    """Remove the files used least recently beyond MOST_BYTES, also what runs that were killed have left.
+
+    Raises OSError.
+    """
     kept = 0
     for status, file in sorted(
         ((file.stat(), file) for file in folder.iterdir()), key=lambda each: -each[0].st_mtime

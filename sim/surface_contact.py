@@ -1,8 +1,10 @@
-"""Contacts of a body's surface with shapes: the penalty method at points of the surface, with Coulomb friction.
+"""Contacts of a body's surface with shapes: the penalty method at points of the surface, with Coulomb
+friction.
 
-The tissue model solves them together with its own forces (``node_force``), so that both are in equilibrium at rest, however
-few iterations a step has. The laws are those of finite elements: pressure = depth x penalty stiffness, and friction
-with elastic tangential slip, limited by the coefficient times the pressure (Wriggers 2006, ch. 5 and 10).
+The tissue model solves them together with its own forces (``node_force``), so that both are in equilibrium at
+rest, however few iterations a step has. The laws are those of finite elements: pressure = depth x penalty
+stiffness, and friction with elastic tangential slip, limited by the coefficient times the pressure (Wriggers
+2006, ch. 5 and 10).
 """
 
 import numpy as np
@@ -21,7 +23,8 @@ from sim.shapes import FAR, TimeOfImpact, check_count
 PENALTY_DEPTH_MM = 0.05
 # Tangential stiffness over normal stiffness.
 TANGENTIAL_RATIO = 0.5
-# A contact plane is reused until the point has moved this far; a shape of 4 mm radius is 0.003 mm off its plane there.
+# A contact plane is reused until the point has moved this far; a shape of 4 mm radius is 0.003 mm off its
+# plane there.
 REUSE_MM = 0.15
 # Points nearer than this to a shape may touch it within the step.
 NEAR_MM = 3.0
@@ -32,11 +35,13 @@ REACH_MM = 6.0
 
 
 class SurfaceContacts:
-    """Contact points on the surface, each interpolated from 8 nodes, and their contacts; at most MOST_SHAPES shapes.
+    """Contact points on the surface, each interpolated from 8 nodes, and their contacts; at most MOST_SHAPES
+    shapes.
 
-    point (p,): current positions [mm]. plane (shapes, p): normal and offset of n . x >= offset [mm]. slip (shapes, p): elastic
-    tangential slip [mm]. near (p,): bits of the shapes that are near. found (shapes, p): point and distance [mm] of the last
-    distance query. ``stiffness`` [kPa/mm]: penalty stiffness; ``coefficient``: Coulomb's, where there was friction from the start.
+    point (p,): current positions [mm]. plane (shapes, p): normal and offset of n . x >= offset [mm]. slip
+    (shapes, p): elastic tangential slip [mm]. near (p,): bits of the shapes that are near. found (shapes, p):
+    point and distance [mm] of the last distance query. ``stiffness`` [kPa/mm]: penalty stiffness;
+    ``coefficient``: Coulomb's, where there was friction from the start.
     """
 
     def __init__(
@@ -75,7 +80,9 @@ class SurfaceContacts:
         self.reset()
 
     def _interpolation(self, lattice: Lattice, points: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Nodes and weights (p, 8) of points; and by node: the first entry (n + 1,), the points and their weights (8 p,)."""
+        """Nodes and weights (p, 8) of points; and by node: the first entry (n + 1,), the points and their
+        weights (8 p,).
+        """
         nodes, weights = lattice.interpolation.attach(points)
         offsets = np.arange(0, nodes.size + 1, nodes.shape[1])
         of_nodes = csr_array(
@@ -84,7 +91,9 @@ class SurfaceContacts:
         return nodes, weights, of_nodes.indptr, of_nodes.indices, of_nodes.data
 
     def set_points(self, lattice: Lattice, points: np.ndarray, area_mm2: np.ndarray) -> None:
-        """Put the contact points at other places (p, 3) [mm] at rest, with other areas (p,) [mm^2]; those of another place lose their friction."""
+        """Put the contact points at other places (p, 3) [mm] at rest, with other areas (p,) [mm^2]; those
+        of another place lose their friction.
+        """
         before = array_of(self.node), array_of(self.weight)
         self.rest_points, self.rest_area_mm2 = points, area_mm2
         fields = self.node, self.weight, self.node_start, self.node_point, self.node_weight
@@ -139,7 +148,9 @@ class SurfaceContacts:
 
     @ti.func
     def free_fraction(self, start, end):
-        """Fraction of a point's path that is free of shapes; 1 for paths so short that ``find`` sees the shapes."""
+        """Fraction of a point's path that is free of shapes; 1 for paths so short that ``find`` sees the
+        shapes.
+        """
         return self.time_of_impact.fraction(start, end - start, NEAR_MM)
 
     @ti.func
@@ -151,7 +162,9 @@ class SurfaceContacts:
 
     @ti.func
     def tangential_slip(self, s: ti.template(), q, depth):
-        """Elastic slip of point q on shape s, limited by friction (return mapping), and the fraction that is left."""
+        """Elastic slip of point q on shape s, limited by friction (return mapping), and the fraction that
+        is left.
+        """
         normal = self.plane[s, q].xyz
         p = self.point[q]
         slip = tangential(self.slip[s, q] + p - self.start[q] - self.shapes[s].motion(p), normal)
@@ -188,10 +201,11 @@ class SurfaceContacts:
 
     @ti.func
     def point_force(self, q, p, has_force):
-        """Force [uN] on point q if it were at p, with the contact planes of the last substep, and its stiffness (3, 3).
+        """Force [uN] on point q if it were at p, with the contact planes of the last substep, and its
+        stiffness (3, 3).
 
-        Without ``has_force``: no force, and the normal stiffness alone. Sliding points resist by friction over slip, which is
-        more than the derivative: so Newton's method converges.
+        Without ``has_force``: no force, and the normal stiffness alone. Sliding points resist by friction
+        over slip, which is more than the derivative: so Newton's method converges.
         """
         force, stiffness = tm.vec3(0.0), tm.mat3(0.0)
         near = self.near[q]
@@ -242,7 +256,8 @@ class SurfaceContacts:
                     self.slip[s, q] = slip
 
     def wrench(self, shape: object, about: np.ndarray) -> np.ndarray:
-        """Force [N] of the tissue on a shape, and its torque [N mm] about a point (3,) [mm]: (6,), in the last step.
+        """Force [N] of the tissue on a shape, and its torque [N mm] about a point (3,) [mm]: (6,), in the
+        last step.
 
         These are the forces that balance those in the tissue, friction included.
         """

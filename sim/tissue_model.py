@@ -17,10 +17,12 @@ from sim.surface_contact import SurfaceContacts
 
 @dataclass(frozen=True)
 class ModelInputs:
-    """What a tissue model is made from: an organ [mm], the shapes around it, and the scene's settings of the tissue.
+    """What a tissue model is made from: an organ [mm], the shapes around it, and the scene's settings of the
+    tissue.
 
-    ``organ`` is a closed surface, or what the model itself accepts instead; ``tissue`` has the model's parameters by the names
-    of its section; ``friction`` is Coulomb's coefficient on shapes; ``parts`` have their own material, a later one where they overlap. ``serial``: run a step as one kernel on one core; None
+    ``organ`` is a closed surface, or what the model itself accepts instead; ``tissue`` has the model's
+    parameters by the names of its section; ``friction`` is Coulomb's coefficient on shapes; ``parts`` have
+    their own material, a later one where they overlap. ``serial``: run a step as one kernel on one core; None
     decides by size and machine. ``relaxation`` and ``mass_scaling_per_mm`` are for shape matching.
     """
 
@@ -37,13 +39,15 @@ class ModelInputs:
 
 
 class TissueModel(Protocol):
-    """Rest state, projection of the constraints on the predicted positions, and what carries points of the tissue along.
+    """Rest state, projection of the constraints on the predicted positions, and what carries points of the
+    tissue along.
 
-    ``serial``: the model is too small for more than one core of a CPU. ``EMBEDDING_CELL_RATIO``: width of the coarse tetrahedra
-    that carry the image plane, over the resolution of the tissue. ``begin`` to ``project`` are ti.funcs that the solver's
-    kernels inline, so their outermost loops are parallel. A model whose material can be
-    changed between steps also has ``set_material(young_kpa)``. One that carries more than the body from step to step has ``history``, these
-    fields by name, which its ti.func ``finish(dt)`` updates at the end of each substep.
+    ``serial``: the model is too small for more than one core of a CPU. ``EMBEDDING_CELL_RATIO``: width of the
+    coarse tetrahedra that carry the image plane, over the resolution of the tissue. ``begin`` to ``project``
+    are ti.funcs that the solver's kernels inline, so their outermost loops are parallel. A model whose
+    material can be changed between steps also has ``set_material(young_kpa)``. One that carries more than the
+    body from step to step has ``history``, these fields by name, which its ti.func ``finish(dt)`` updates at
+    the end of each substep.
     """
 
     EMBEDDING_CELL_RATIO: ClassVar[float]

@@ -1,8 +1,9 @@
 """Relaxation of the tissue: finite-strain viscoelasticity with a Prony series.
 
-S(t) = S_e(t) + sum_i gamma_i int exp(-(t - s) / tau_i) dS_e(s), with the elastic second Piola-Kirchhoff stress S_e; the integral is updated
-from step to step (Simo & Hughes 1998, Sec. 10.3; Holzapfel 2000, Eq. 6.245). Stresses at rest are the elastic ones, so Young's modulus is that
-of slow deformation; a fast one is resisted (1 + sum gamma_i) times as much.
+S(t) = S_e(t) + sum_i gamma_i int exp(-(t - s) / tau_i) dS_e(s), with the elastic second Piola-Kirchhoff
+stress S_e; the integral is updated from step to step (Simo & Hughes 1998, Sec. 10.3; Holzapfel 2000, Eq.
+6.245). Stresses at rest are the elastic ones, so Young's modulus is that of slow deformation; a fast one is
+resisted (1 + sum gamma_i) times as much.
 """
 
 from collections.abc import Sequence
@@ -28,8 +29,8 @@ class PronyTerm:
 class Relaxation:
     """Stress history of ``count`` elements, of stresses relative to each element's stiffness.
 
-    elastic (m,): S_e at the end of the last substep; overstress (m, terms): the integrals. In a substep the stress is
-    ``factor`` S_e + ``history`` (m,).
+    elastic (m,): S_e at the end of the last substep; overstress (m, terms): the integrals. In a substep the
+    stress is ``factor`` S_e + ``history`` (m,).
     """
 
     def __init__(self, terms: Sequence[PronyTerm], count: int) -> None:
@@ -57,7 +58,9 @@ class Relaxation:
 
     @ti.func
     def begin(self, dt: float):
-        """The part of the stress that does not depend on the new positions, and the factor of the part that does."""
+        """The part of the stress that does not depend on the new positions, and the factor of the part
+        that does.
+        """
         for _ in range(1):
             factor = 1.0
             for t in range(self.terms):

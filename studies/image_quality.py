@@ -14,7 +14,9 @@ def speckle_snr(amplitude: np.ndarray) -> float:
 
 
 def correlation_length(amplitude: np.ndarray, axis: int) -> float:
-    """Return the lag, in samples of an axis, at which the intensity of a region correlates by 1/2; nan where it never does."""
+    """Return the lag, in samples of an axis, at which the intensity of a region correlates by 1/2; nan
+    where it never does.
+    """
     intensity = np.moveaxis(amplitude**2, axis, 0)
     intensity = intensity - intensity.mean()
     curve = [
@@ -28,7 +30,9 @@ def correlation_length(amplitude: np.ndarray, axis: int) -> float:
 
 
 def without_depth_trend(amplitude: np.ndarray) -> np.ndarray:
-    """Return amplitudes (scanlines, samples) divided by an exponential of depth, which attenuation and TGC leave in a region."""
+    """Return amplitudes (scanlines, samples) divided by an exponential of depth, which attenuation and TGC
+    leave in a region.
+    """
     sample = np.arange(amplitude.shape[1])
     level = np.polyfit(sample, np.log((amplitude**2).mean(axis=0)) / 2, 1)
     return amplitude / np.exp(np.polyval(level, sample))
@@ -40,8 +44,9 @@ def contrast_db(inside: np.ndarray, outside: np.ndarray) -> float:
 
 
 def gcnr(inside: np.ndarray, outside: np.ndarray) -> float:
-    """Return the generalized contrast-to-noise ratio of amplitudes: 1 - overlap of their distributions (Rodriguez-Molares 2020, IEEE
-    TUFFC 67, 745, equation 10). A monotonic grey map does not change it; the histograms are of logarithms, whose bins are alike.
+    """Return the generalized contrast-to-noise ratio of amplitudes: 1 - overlap of their distributions
+    (Rodriguez-Molares 2020, IEEE TUFFC 67, 745, equation 10). A monotonic grey map does not change it; the
+    histograms are of logarithms, whose bins are alike.
     """
     logs = [np.log(np.maximum(each.ravel(), np.finfo(float).tiny)) for each in (inside, outside)]
     edges = np.histogram_bin_edges(np.concatenate(logs), GCNR_BINS)

@@ -12,7 +12,10 @@ from text_files import TextError, read_text, table_rows
 def read_numbers(
     path: Path, columns: Sequence[str], error_type: type[UserError]
 ) -> tuple[np.ndarray, list[int]]:
-    """Values (rows, columns) of the named columns, and the rows' lines in the file (rows,). Raises ``error_type`` for a file, a column or a value that is not valid."""
+    """Values (rows, columns) of the named columns, and the rows' lines in the file (rows,).
+
+    Raises ``error_type`` for a file, a column or a value that is not valid.
+    """
     try:
         table = table_rows(read_text(path))
     except (FileNotFoundError, NotADirectoryError):
@@ -26,7 +29,8 @@ def read_numbers(
     missing = [name for name in columns if name not in heads]
     if missing:
         raise error_type(
-            f"{path}: column {missing[0]} is missing; expected {len(columns)} columns, {columns[0]} to {columns[-1]}"
+            f"{path}: column {missing[0]} is missing; expected {len(columns)} columns, {columns[0]} to "
+            f"{columns[-1]}"
         )
     values = [[_number(row.get(name)) for name in columns] for row in rows]
     numbers = np.array(values)

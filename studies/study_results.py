@@ -22,7 +22,9 @@ def text_table(headers: Sequence[str], rows: Sequence[Sequence[Any]], formats: S
 
 
 def table_of(columns: Collection[tuple[str, str]], rows: Iterable[Mapping[str, Any]]) -> str:
-    """Aligned columns: under each header (first of a pair) a format of a row's values, such as "{ms:.2f}"; empty where that value is None."""
+    """Aligned columns: under each header (first of a pair) a format of a row's values, such as "{ms:.2f}";
+    empty where that value is None.
+    """
     cells = [[_formatted(form, row) for _, form in columns] for row in rows]
     sides = ["right" if ":" in form else "left" for _, form in columns]
     return tabulate(
@@ -40,7 +42,9 @@ def _formatted(form: str, row: Mapping[str, Any]) -> str:
 def finish_axes(
     axes: "Axes", legend: dict[str, Any] | None = None, grid: Literal["both", "x"] = "both", **settings: Any
 ) -> None:
-    """Titles, labels and scales of a panel, as ``Axes.set`` takes them; its grid, and a legend with these options."""
+    """Titles, labels and scales of a panel, as ``Axes.set`` takes them; its grid, and a legend with these
+    options.
+    """
     axes.set(**settings)
     axes.grid(alpha=0.3, which="both", axis=grid)
     if legend is not None:
@@ -55,7 +59,9 @@ def write_results(
     rows: list[dict[str, Any]] | None = None,
     figure: "Figure | None" = None,
 ) -> None:
-    """Write name.json and, where there are any, name.csv and name.png into a folder; print the text and their names."""
+    """Write name.json and, where there are any, name.csv and name.png into a folder; print the text and
+    their names.
+    """
     files = [f"{name}.json"]
     write_json(report, out / files[0])
     if rows is not None:

@@ -18,7 +18,9 @@ FRICTION, CLUSTER_SPACING = 0.35, 3.33
 
 
 def block_of_cells(side: int, cell_mm: float, shapes: list, tool: ConvexTool | None = None) -> Solver:
-    """A cube with a corner at the origin, ``side`` cells along each edge, in contact with shapes, one of which may be the tool."""
+    """A cube with a corner at the origin, ``side`` cells along each edge, in contact with shapes, one of
+    which may be the tool.
+    """
     lattice = fill_block((side, side, side), cell_mm)
     body = Body(lattice.nodes)
     cube = trimesh.creation.box(bounds=[[0.0] * 3, [side * cell_mm] * 3])
@@ -29,7 +31,9 @@ def block_of_cells(side: int, cell_mm: float, shapes: list, tool: ConvexTool | N
 def block_of_particles(
     points_mm: np.ndarray, radius_mm: float, shapes: list, tool: ConvexTool | None = None
 ) -> Solver:
-    """Particles at points (n, 3) [mm], a radius apart, in contact with shapes, one of which may be the tool."""
+    """Particles at points (n, 3) [mm], a radius apart, in contact with shapes, one of which may be the
+    tool.
+    """
     rest = RestBody(points_mm, radius_mm, np.full(len(points_mm), radius_mm / 2))
     arranged, patches = group_into_patches(rest, CLUSTER_SPACING)
     body = ParticleBody(arranged)

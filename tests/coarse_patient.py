@@ -19,7 +19,9 @@ def thinned(grid: Grid) -> Grid:
 
 
 def coarse_patient() -> tuple[Rehearsal, LoadedAnatomy]:
-    """Its rehearsal on elements of 8 mm, with images of 32 x 32 pixels of few scanlines, and its anatomy; Taichi must be started."""
+    """Its rehearsal on elements of 8 mm, with images of 32 x 32 pixels of few scanlines, and its anatomy;
+    Taichi must be started.
+    """
     scene = with_options(load_scene(EMBEDDED), {"tissue.cell_mm": 8.0, "image.mode": "b-mode"})
     short = dict(press=scene.press.model_copy(update={"warm_up_steps": 20}))
     small = dict(image=scene.image.model_copy(update={"pixels": 32}))

@@ -8,7 +8,8 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
-# Each worker has a core of its own: threads of several libraries on each would wait for one another. Read when these are imported.
+# Each worker has a core of its own: threads of several libraries on each would wait for one another. Read
+# when these are imported.
 if "PYTEST_XDIST_WORKER" in os.environ:
     for threads in ("TI_CPU_MAX_NUM", "OMP_NUM", "OPENBLAS_NUM", "ITK_GLOBAL_DEFAULT_NUMBER_OF"):
         os.environ.setdefault(f"{threads}_THREADS", "1")
@@ -35,7 +36,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest first: no worker is left with it when the others have ended, nor takes half of a file whose fixture takes long.
+    """The longest first: no worker is left with it when the others have ended, nor takes half of a file whose
+    fixture takes long.
 
     Scenes last: they have no kernels, so that one of two workers compiles nearly all.
     """
@@ -63,7 +65,8 @@ def one_device():
 
 @pytest.fixture(scope="module")
 def kept(one_device) -> Callable:
-    """Calls a function that makes something on the device, or, where a test of the file has called it so before, gives that again.
+    """Calls a function that makes something on the device, or, where a test of the file has called it so
+    before, gives that again.
 
     What has a ``snapshot`` is put back as it was made; a tool stays where it is.
     """
@@ -91,7 +94,9 @@ def kept(one_device) -> Callable:
 
 @pytest.fixture(scope="module")
 def arrays_stored(tmp_path_factory) -> Iterator[None]:
-    """For files in which the same organ is built again and again, and no two computations are compared: its arrays are stored, as in use."""
+    """For files in which the same organ is built again and again, and no two computations are compared:
+    its arrays are stored, as in use.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stored_arrays, "FOLDER", tmp_path_factory.getbasetemp() / "arrays")
         yield
@@ -107,7 +112,9 @@ def nothing_built() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[str]:
-    """The address of a Dask cluster of one worker with two threads: this process, reached as any other would be."""
+    """The address of a Dask cluster of one worker with two threads: this process, reached as any other
+    would be.
+    """
     from distributed import LocalCluster
 
     with LocalCluster(

@@ -1,4 +1,6 @@
-"""A ball-shaped organ with a score around its top, and cuts of it by planes and balls, whose figures have closed forms."""
+"""A ball-shaped organ with a score around its top, and cuts of it by planes and balls, whose figures have
+closed forms.
+"""
 
 import numpy as np
 import trimesh
@@ -8,7 +10,8 @@ from rehearsal.resection.score_line import ScoreLine, score_line
 from scenes.solids import solid_of, surface_of
 
 R = 30.0
-# The score's marks are at this angle from the top, in such a number; the line is as high as RIM_MM and as wide.
+# The score's marks are at this angle from the top, in such a number; the line is as high as RIM_MM and as
+# wide.
 MARKS, ANGLE = 60, np.radians(35)
 RIM_MM, HEIGHT_MM = R * np.sin(ANGLE), R * np.cos(ANGLE)
 

@@ -267,7 +267,9 @@ def write_segmentation(
     kind: str = "BINARY",
     slices: Iterable[int] | None = None,
 ) -> Path:
-    """A DICOM-SEG of masks (z, y, x) by their labels; the masks of a FRACTIONAL one are shares from 0 to 1."""
+    """A DICOM-SEG of masks (z, y, x) by their labels; the masks of a FRACTIONAL one are shares from 0 to
+    1.
+    """
     used = list(range(series.size[2]) if slices is None else slices)
     described = [
         hd.seg.SegmentDescription(
@@ -310,7 +312,9 @@ def write_structures(
     sops: Iterable[str] = (),
     edit: Callable[[FileDataset], None] = lambda data: None,
 ) -> Path:
-    """An RTSTRUCT of closed contours (n, 3) in LPS by the names of their regions, and the CT that it refers to."""
+    """An RTSTRUCT of closed contours (n, 3) in LPS by the names of their regions, and the CT that it
+    refers to.
+    """
     data = _file(RTStructureSetStorage, generate_uid(), ImplicitVRLittleEndian)
     data.Modality, data.SeriesInstanceUID, data.SeriesNumber = "RTSTRUCT", generate_uid(), 9
     data.StudyInstanceUID = generate_uid()

@@ -1,4 +1,6 @@
-"""A left kidney from closed forms: an ellipsoid with balls as tumours, bites and sinus; surfaces in LPS [mm]."""
+"""A left kidney from closed forms: an ellipsoid with balls as tumours, bites and sinus; surfaces in LPS
+[mm].
+"""
 
 import igl
 import numpy as np

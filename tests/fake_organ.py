@@ -1,4 +1,6 @@
-"""An organ of two points whose steps are arithmetic: all that a timeline needs of a ``PressedOrgan``, in microseconds."""
+"""An organ of two points whose steps are arithmetic: all that a timeline needs of a ``PressedOrgan``, in
+microseconds.
+"""
 
 import hashlib
 from types import SimpleNamespace
@@ -15,7 +17,9 @@ STEP_S = 0.125
 
 
 class FakeOrgan:
-    """Each step depends on all that a step depends on: state, pose, length, iterations, stiffness of the material, the good state."""
+    """Each step depends on all that a step depends on: state, pose, length, iterations, stiffness of the
+    material, the good state.
+    """
 
     def __init__(self) -> None:
         self.case = SimpleNamespace(organ=None, tumour=None, parts={})

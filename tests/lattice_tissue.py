@@ -31,7 +31,9 @@ def tissue_of(
     poisson: float = 0.45,
     fixed=None,
 ) -> Solver:
-    """A solver of a closed surface [mm] among shapes; ``fixed`` takes nodes (n, 3) and returns the mask of the fixed ones."""
+    """A solver of a closed surface [mm] among shapes; ``fixed`` takes nodes (n, 3) and returns the mask of
+    the fixed ones.
+    """
     lattice = fill_with_cells(mesh, cell_mm)
     body = Body(lattice.nodes)
     contacts = None
@@ -72,12 +74,13 @@ def lame_parameters(poisson: float) -> tuple[float, float]:
 
 
 class Energy:
-    """Elastic and hourglass energy of each cell in float64 or complex128, and its derivatives colour by colour.
+    """Elastic and hourglass energy of each cell in float64 or complex128, and its derivatives colour by
+    colour.
 
     ``mu`` and ``lambda_`` are those of all cells, or (m,) of each.
 
-    Nodes of one colour have no cell in common: all of them can be moved at once, and the cells around a node tell
-    its own derivative.
+    Nodes of one colour have no cell in common: all of them can be moved at once, and the cells around a node
+    tell its own derivative.
     """
 
     def __init__(self, lattice: Lattice, poisson: float = 0.45, mu=None, lambda_=None) -> None:
@@ -108,7 +111,9 @@ class Energy:
         )
 
     def hessian(self, x: np.ndarray, colour: int, step: float = 1e-4) -> np.ndarray:
-        """d^2E/dx^2 (n of the colour, 3, 3) by each node's own position, by central differences of the slope."""
+        """d^2E/dx^2 (n of the colour, 3, 3) by each node's own position, by central differences of the
+        slope.
+        """
         first, last = self.lattice.colour_start[colour : colour + 2]
         rows = []
         for axis in range(3):

@@ -1,4 +1,6 @@
-"""A tiny bead experiment as files: a ball in a bowl under a probe, with made-up measurements; and the two as a patient."""
+"""A tiny bead experiment as files: a ball in a bowl under a probe, with made-up measurements; and the two
+as a patient.
+"""
 
 import json
 from pathlib import Path
@@ -50,7 +52,9 @@ def values() -> dict:
 
 
 def beads() -> np.ndarray:
-    """Stress-free and measured places (stages + 1, n, 3) [mm]: pressed, the upper half moves down and outward."""
+    """Stress-free and measured places (stages + 1, n, 3) [mm]: pressed, the upper half moves down and
+    outward.
+    """
     random = np.random.default_rng(3)
     rest = random.uniform(-6, 6, (12, 3))
     sunk = rest - [0, 0, 0.2]

@@ -27,13 +27,17 @@ SPACINGS = {"thick": (1.3, 1.1, 4.5), "even": (1.5, 1.5, 1.5)}
 
 
 def coarsely(patch):
-    """While a patch lasts, surfaces and supports are made on coarse grids: they are tested by themselves, and take seconds."""
+    """While a patch lasts, surfaces and supports are made on coarse grids: they are tested by themselves,
+    and take seconds.
+    """
     patch.setattr("scenes.patients.label_surfaces.CELL_MM", (3.0, 3.0))
     patch.setattr("scenes.patients.organ_support.GRID_MM", 3.0)
 
 
 def without_picture(patch):
-    """While a patch lasts, an import leaves an empty check.png: it is tested by itself, and takes a second to draw."""
+    """While a patch lasts, an import leaves an empty check.png: it is tested by itself, and takes a second
+    to draw.
+    """
     patch.setattr(
         "scenes.patients.check_picture.draw_check",
         lambda patient, rows, folder: (folder / "check.png").touch(),

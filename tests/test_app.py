@@ -82,7 +82,9 @@ def refused(*arguments) -> str:
 
 @pytest.fixture(scope="module")
 def pressed(tmp_path_factory) -> Path:
-    """The folder of a short press of the embedded patient, with what was said: no command, no display, no choice of picture."""
+    """The folder of a short press of the embedded patient, with what was said: no command, no display, no
+    choice of picture.
+    """
     out = tmp_path_factory.mktemp("press")
     done = run(*SHORT, "--out", out)
     assert done.returncode == 0, done.stderr
@@ -208,7 +210,10 @@ def volumes(tmp_path_factory) -> tuple[Path, Path]:
 @pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("after_s", [0.3, 0.9, 2.0])
 def test_an_import_that_is_stopped_ends_in_words_and_leaves_nothing(volumes, tmp_path, kind, after_s):
-    begun = "import runpy, sys; print(flush=True); sys.argv[0] = 'app.py'; runpy.run_path('app.py', run_name='__main__')"
+    begun = (
+        "import runpy, sys; print(flush=True); sys.argv[0] = 'app.py'; runpy.run_path('app.py', "
+        "run_name='__main__')"
+    )
     wanted = "import", *volumes, "--organ", "2", "--tumour", "3", "--out", tmp_path / "out"
     program = subprocess.Popen(
         [sys.executable, "-c", begun, *map(str, wanted)],
@@ -362,7 +367,10 @@ def test_the_list_of_commands_has_each_commands_own_first_sentence(table, name):
 
 
 def test_help_comes_without_the_libraries_that_take_seconds():
-    asked = "import sys, app; app.main(['--help']); print({'taichi', 'trimesh', 'matplotlib', 'pydantic'} & set(sys.modules))"
+    asked = (
+        "import sys, app; app.main(['--help']); print({'taichi', 'trimesh', 'matplotlib', 'pydantic'} & "
+        "set(sys.modules))"
+    )
     done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, cwd=ROOT)
     assert done.stdout.strip().endswith("set()"), done.stdout
 
@@ -419,7 +427,10 @@ def test_a_real_kidney_comes_in_and_gives_way(data, tmp_path, monkeypatch, capsy
 @pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
 def test_no_file_gets_the_number_of_a_closed_stream(tmp_path, closed):
     """What a library prints would be written into that file."""
-    script = "import app, sys; app.main(['--version']); print(open(sys.argv[1], 'w').fileno(), file=open(sys.argv[2], 'w'))"
+    script = (
+        "import app, sys; app.main(['--version']); print(open(sys.argv[1], 'w').fileno(), "
+        "file=open(sys.argv[2], 'w'))"
+    )
     names = [str(tmp_path / "first"), str(tmp_path / "number")]
     subprocess.run(
         ["sh", "-c", f'exec "$@" {closed}', "sh", sys.executable, "-c", script, *names], cwd=ROOT, check=True

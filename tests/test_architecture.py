@@ -14,7 +14,8 @@ import taichi
 from conftest import ROOT
 
 LAYERS = ("app", "studies", "rehearsal", "render", "ultrasound", "sim", "scenes")
-# app -> studies -> rehearsal -> render, ultrasound -> sim, and scenes is data: what a layer must not know, and which libraries.
+# app -> studies -> rehearsal -> render, ultrasound -> sim, and scenes is data: what a layer must not know,
+# and which libraries.
 FORBIDDEN = {
     "scenes": {"app", "studies", "rehearsal", "render", "ultrasound", "sim", "taichi"},
     "sim": {"app", "studies", "rehearsal", "render", "ultrasound", "scenes"},
@@ -23,7 +24,8 @@ FORBIDDEN = {
     "rehearsal": {"app", "studies"},
     "studies": {"app"},
 }
-# What of other layers the screen may name: which choices there are, and the folder itself, which keeps Taichi quiet.
+# What of other layers the screen may name: which choices there are, and the folder itself, which keeps Taichi
+# quiet.
 # Solvers, bodies and scanners stay out: it is handed arrays.
 KNOWN_TO_RENDER = {
     "sim",
@@ -63,7 +65,9 @@ class Import(NamedTuple):
 
 
 def module_of(path: Path) -> str:
-    """The name of a file of the project: scenes/patients/readers/ct_series.py -> scenes.patients.readers.ct_series."""
+    """The name of a file of the project: scenes/patients/readers/ct_series.py ->
+    scenes.patients.readers.ct_series.
+    """
     return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 

@@ -255,7 +255,8 @@ def test_the_example_of_a_tool_presses_tissue():
     finally:
         ti.reset()
     depth_mm = float(re.findall(r"at most ([\d.]+) mm", printed.getvalue())[0])
-    # The tissue is in contact, with at most a few times the depth at which the pressure equals Young's modulus.
+    # The tissue is in contact, with at most a few times the depth at which the pressure equals Young's
+    # modulus.
     assert 0.01 < depth_mm < 0.5
 
 

@@ -1,4 +1,6 @@
-"""Cases from the field for the command line: paths, streams, damaged and foreign files, stray images, lesions apart, probes, fluid."""
+"""Cases from the field for the command line: paths, streams, damaged and foreign files, stray images,
+lesions apart, probes, fluid.
+"""
 
 import json
 import os
@@ -24,7 +26,8 @@ from scenes.terminal import shell_command
 CASE = Path(__file__).parents[1] / "studies" / "reference" / "embedded"
 # Words of Python, pydantic and parsers, which tell a surgeon nothing.
 PYTHONS = re.compile(
-    r"codec can't|instance of|max_str_digits|recursion|not iterable|Errno|is None|Expecting value|\(char \d|extract fields|datetime\."
+    r"codec can't|instance of|max_str_digits|recursion|not iterable|Errno|is None|Expecting "
+    r"value|\(char \d|extract fields|datetime\."
 )
 DEEP, LONG = "[" * 100_000, "9" * 5000
 APART = np.array([125.0, 35.0, -40.0]), np.full(3, 8.0)  # 20 mm and more beside the left kidney
@@ -290,7 +293,9 @@ def test_a_volume_under_a_wrong_name_is_called_what_it_is(volumes, tmp_path, cap
 
 
 def beside(series: Series, k: int, **tags):
-    """A further image of a series: a slice with other tags, and a UID of its own; without those that are None."""
+    """A further image of a series: a slice with other tags, and a UID of its own; without those that are
+    None.
+    """
     data = series.slice(k, **tags)
     data.SOPInstanceUID = data.file_meta.MediaStorageSOPInstanceUID = generate_uid()
     return data
@@ -327,7 +332,9 @@ def test_an_image_that_is_no_slice_of_the_ct_is_left_out(tmp_path, tags):
 
 @pytest.mark.parametrize("first", [0.5, 6.0], ids=["between the slices", "after them"])
 def test_thick_slabs_of_a_projection_are_no_slices(tmp_path, first):
-    """Axial MIP slabs derived at the console, stored under the CT's own series UID: left out or refused, never stacked with it."""
+    """Axial MIP slabs derived at the console, stored under the CT's own series UID: left out or refused,
+    never stacked with it.
+    """
     series = Series(tmp_path)
     series.write()
     for k in range(5):
@@ -381,7 +388,9 @@ def test_a_cd_with_viewer_is_read(tmp_path, capsys):
 def test_a_lesion_apart_from_the_kidney_is_not_left_out_in_silence(
     volumes, tmp_path, monkeypatch, solids, options, word
 ):
-    """A lesion of 2 ml that the user named, 20 mm beside the kidney: a warning or note says that it was left out."""
+    """A lesion of 2 ml that the user named, 20 mm beside the kidney: a warning or note says that it was
+    left out.
+    """
     coarsely(monkeypatch)
     without_picture(monkeypatch)
     ct = sitk.ReadImage(str(volumes / "ct.nii.gz"))
@@ -402,7 +411,9 @@ def test_a_lesion_apart_from_the_kidney_is_not_left_out_in_silence(
     "probe", ["convex", "Drop-In", "/nope/probe.toml", "a folder", "a volume", "a code page"]
 )
 def test_a_probe_that_is_none_is_refused_in_words(volumes, tmp_path, capsys, probe):
-    """--probe with a name that is not known, a missing file, a folder, a CT, a file of Notepad's code page."""
+    """--probe with a name that is not known, a missing file, a folder, a CT, a file of Notepad's code
+    page.
+    """
     (tmp_path / "probe.toml").write_bytes("# Müller\n".encode("cp1252"))
     places = {"a folder": tmp_path, "a volume": volumes / "ct.nii.gz", "a code page": tmp_path / "probe.toml"}
     path = places.get(probe, probe)

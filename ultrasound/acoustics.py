@@ -1,7 +1,8 @@
 """Acoustic properties of voxels from their tissue and HU: impedance, attenuation and backscatter. NumPy.
 
-A voxel has its tissue's values (``acoustic_tissues.toml``), as contrast agent raises HU by iodine, not by density. Within a tissue, what is
-denser in the CT scatters a little more. Voxels without a tissue have values by HU.
+A voxel has its tissue's values (``acoustic_tissues.toml``), as contrast agent raises HU by iodine, not by
+density. Within a tissue, what is denser in the CT scatters a little more. Voxels without a tissue have values
+by HU.
 """
 
 import json
@@ -18,12 +19,14 @@ from errors import UserError
 from sim.stored_arrays import stored
 
 TISSUES = Path(__file__).parent / "acoustic_tissues.toml"
-# Amplitude of renal cortex relative to a perfect reflector: its speckle is some 16 dB below the echo of fat on kidney.
+# Amplitude of renal cortex relative to a perfect reflector: its speckle is some 16 dB below the echo of fat
+# on kidney.
 CORTEX_DB = -38.0
-# Smooths the voxel steps of labels; the level of scattering, in dB, by less, so that a cyst of three voxels reaches its level.
+# Smooths the voxel steps of labels; the level of scattering, in dB, by less, so that a cyst of three voxels
+# reaches its level.
 SMOOTHING_VOXELS, LEVEL_SMOOTHING_VOXELS = 0.8, 0.5
-# From the first to the second HU unlabelled tissue has the impedance of the first: contrast agent raises HU, not density. From the
-# third on it is calcified.
+# From the first to the second HU unlabelled tissue has the impedance of the first: contrast agent raises HU,
+# not density. From the third on it is calcified.
 AGENT_FROM_HU, AGENT_TO_HU, CALCIFIED_HU = 55.0, 200.0, 300.0
 # Mast 2000: density [kg/m3] = slope * speed of sound [m/s] - offset.
 MAST_SLOPE, MAST_OFFSET = 0.893, 349.0
@@ -32,7 +35,8 @@ MIN_HU, MAX_HU = -1024, 3071
 
 CHANNELS = IMPEDANCE, ATTENUATION, BACKSCATTER, ANISOTROPY = range(4)
 
-# Within a tissue, backscatter rises with HU [dB/HU], up to this much [dB]; HU are averaged over this distance.
+# Within a tissue, backscatter rises with HU [dB/HU], up to this much [dB]; HU are averaged over this
+# distance.
 DB_OF_HU, MOST_OF_HU_DB, OF_HU_MM = 0.07, 3.0, 1.5
 HARD_TISSUES = ("stone", "metal")
 # Arcuate vessels: thickness of the layer, distance and share of the places that have them.
@@ -53,7 +57,9 @@ def tissue_table() -> dict[str, dict]:
 
 @dataclass(frozen=True)
 class TissueVoxels:
-    """HU and labels (nx, ny, nz) on a grid that ``index_from_mm`` (4, 4) gives, and the tissue of each label."""
+    """HU and labels (nx, ny, nz) on a grid that ``index_from_mm`` (4, 4) gives, and the tissue of each
+    label.
+    """
 
     hu: np.ndarray
     labels: np.ndarray | None
@@ -78,13 +84,14 @@ def check_tissues(tissue_of_label: Mapping[int, str]) -> None:
     for label, tissue in tissue_of_label.items():
         if tissue not in known:
             raise TissueError(
-                f"anatomy.tissues: label {label} is {tissue!r}: no tissue of that name; known: {', '.join(known)}"
+                f"anatomy.tissues: label {label} is {tissue!r}: no tissue of that name; known: "
+                f"{', '.join(known)}"
             )
 
 
 def impedance_of_hu(hu: np.ndarray) -> np.ndarray:
-    """Return acoustic impedance [MRayl] of HU: density by Schneider's piecewise fit (k-Wave's ``hounsfield2density``), speed of sound
-    from density by Mast 2000, for soft tissue."""
+    """Return acoustic impedance [MRayl] of HU: density by Schneider's piecewise fit (k-Wave's
+    ``hounsfield2density``), speed of sound from density by Mast 2000, for soft tissue."""
     h = np.asarray(hu, np.float32) + np.float32(1000)
     pieces = [h < 930, h < 1098, h < 1260]
     slope = np.select(pieces, [1.025793065, 0.9082709691, 0.5108369316], 0.6625370912).astype(np.float32)
@@ -94,7 +101,9 @@ def impedance_of_hu(hu: np.ndarray) -> np.ndarray:
 
 
 def impedance_of_tissue(hu: np.ndarray) -> np.ndarray:
-    """Return acoustic impedance [MRayl] of unlabelled tissue, perhaps with contrast agent: see AGENT_FROM_HU."""
+    """Return acoustic impedance [MRayl] of unlabelled tissue, perhaps with contrast agent: see
+    AGENT_FROM_HU.
+    """
     without = np.interp(
         hu, [AGENT_FROM_HU, AGENT_TO_HU, CALCIFIED_HU], [AGENT_FROM_HU, AGENT_FROM_HU, CALCIFIED_HU]
     )
@@ -120,10 +129,11 @@ def properties(
     tissue_of_label: Mapping[int, str] | None = None,
     spacing_mm: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return impedance [MRayl], attenuation [dB/cm/MHz], backscattered amplitude (1: perfect reflector) and its anisotropy [dB], (..., 4)
-    float32.
+    """Return impedance [MRayl], attenuation [dB/cm/MHz], backscattered amplitude (1: perfect reflector) and
+    its anisotropy [dB], (..., 4) float32.
 
-    ``hu`` and ``labels`` have the same shape; 0 and labels without a tissue have values by HU. Raises TissueError.
+    ``hu`` and ``labels`` have the same shape; 0 and labels without a tissue have values by HU. Raises
+    TissueError.
     """
     tissues = dict(tissue_of_label or {})
     check_tissues(tissues)
@@ -189,9 +199,11 @@ def _texture(codes: np.ndarray, names: list[str], spacing_mm: np.ndarray) -> np.
 
 
 def _variation(hu: np.ndarray, codes: np.ndarray, names: list[str], spacing_mm: np.ndarray) -> np.ndarray:
-    """Return how the backscatter level varies with HU within a tissue [dB] (Wein et al. 2008, Med Image Anal 12, 577: echogenicity from HU).
+    """Return how the backscatter level varies with HU within a tissue [dB] (Wein et al. 2008, Med Image Anal
+    12, 577: echogenicity from HU).
 
-    HU are relative to the tissue's own median, so that its borders are none here, and noise can be averaged across them.
+    HU are relative to the tissue's own median, so that its borders are none here, and noise can be averaged
+    across them.
     """
     median = np.zeros(len(names), np.float32)
     follows = np.zeros(len(names), np.float32)
@@ -228,7 +240,9 @@ def _by_hounsfield(hu: np.ndarray) -> np.ndarray:
 
 
 def noise_of(shape: tuple[int, ...], sd_voxels: np.ndarray) -> np.ndarray:
-    """Return noise of unit SD, smoothed by an SD along each axis, the same for the same voxels on every machine."""
+    """Return noise of unit SD, smoothed by an SD along each axis, the same for the same voxels on every
+    machine.
+    """
     noise = np.random.default_rng(SEED).standard_normal(shape, dtype=np.float32)
     noise = ndimage.gaussian_filter(noise, sd_voxels, truncate=2, mode="wrap")
     return noise / max(float(noise.std()), 1e-6)

@@ -1,6 +1,7 @@
 """Rays from the aperture to each sample of a scanline: contact, attenuation and refraction on their paths.
 
-A shadow is soft where a part of the aperture sees past an obstacle, and beside a round one where refraction moves the rays apart.
+A shadow is soft where a part of the aperture sees past an obstacle, and beside a round one where refraction
+moves the rays apart.
 """
 
 import numpy as np
@@ -24,15 +25,16 @@ FINER = 4
 class ApertureRays:
     """Rays to each of ``most`` samples of ``lines`` scanlines: (RAYS, scanlines, samples) at their ends.
 
-    ``amplitude`` and ``path`` [Np/MHz] are one way. ``refraction`` has the angle by which a ray is turned [rad], and its offset [scanlines].
+    ``amplitude`` and ``path`` [Np/MHz] are one way. ``refraction`` has the angle by which a ray is turned
+    [rad], and its offset [scanlines].
     """
 
     def __init__(self, lines: int, most: int) -> None:
         self.lines, shape = lines, (RAYS, lines, most)
         self.amplitude, self.path = (zeros(*shape) for _ in range(2))
         self.refraction = zeros(*shape, 2, within=1)
-        # How many scanlines a ray is from its end at a sample, where it leaves the face. It goes from scanline to scanline: mixing
-        # two would spread shadows.
+        # How many scanlines a ray is from its end at a sample, where it leaves the face. It goes from
+        # scanline to scanline: mixing two would spread shadows.
         self.offset = zeros(RAYS, most, kind=ti.i32)
         # Scanlines per mm; half of the Fresnel zone in scanlines.
         self.lines_per_mm, self.zone = zeros(most), zeros(most, kind=ti.i32)
@@ -101,7 +103,9 @@ class ApertureRays:
     def combine(
         self, build_up: ti.template(), count: int, round_trip: ti.template(), round_trip_path: ti.template()
     ):
-        """Write amplitude and path of the round trip: the mean over the rays that start on the array, squared."""
+        """Write amplitude and path of the round trip: the mean over the rays that start on the array,
+        squared.
+        """
         for line, k in ti.ndrange(self.lines, count):
             total, path, found = 0.0, 0.0, 0.0
             for ray in ti.static(range(RAYS)):
@@ -118,7 +122,9 @@ class ApertureRays:
 
     @ti.func
     def focusing(self, ray, line, k):
-        """Return the factor of amplitude of rays that refraction has moved together or apart, over a Fresnel zone."""
+        """Return the factor of amplitude of rays that refraction has moved together or apart, over a
+        Fresnel zone.
+        """
         zone = self.zone[k]
         low, high = ti.max(line - zone, 0), ti.min(line + zone, self.lines - 1)
         further = self.refraction[ray, high, k].y - self.refraction[ray, low, k].y
@@ -134,7 +140,9 @@ class ApertureRays:
 
 
 def fresnel_zones(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
-    """Return half of the Fresnel zone halfway to each depth, at least one scanline, (depths,) int32: less does not bend a wave."""
+    """Return half of the Fresnel zone halfway to each depth, at least one scanline, (depths,) int32: less
+    does not bend a wave.
+    """
     zone_mm = np.sqrt(probe.wavelength_mm * depth_mm) / 2
     return np.maximum(np.rint(zone_mm / np.maximum(probe.line_spacing_mm(depth_mm), 1e-3)), 1).astype(
         np.int32

@@ -17,8 +17,8 @@ TOLERANCE = 1e-9
 class ArrayContact:
     """Contact area of the face, and the greatest compression of the tissue in front of it.
 
-    Compression is how much shorter the tissue is than at rest, along the transducer's axis from where it enters the organ to where
-    it exits it; 0 without contact.
+    Compression is how much shorter the tissue is than at rest, along the transducer's axis from where it
+    enters the organ to where it exits it; 0 without contact.
     """
 
     area_mm2: float = 0.0
@@ -26,7 +26,9 @@ class ArrayContact:
 
 
 def face_points(size_mm: np.ndarray, radius_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (n, 3) evenly over the face, in the transducer's axes [mm], and the area (n,) of each [mm^2]."""
+    """Return points (n, 3) evenly over the face, in the transducer's axes [mm], and the area (n,) of each
+    [mm^2].
+    """
     counts = np.maximum(np.rint(np.asarray(size_mm[:2]) / SPACING_MM).astype(int), 1)
     x, y = ((np.arange(n) + 0.5) / n * s - s / 2 for n, s in zip(counts, size_mm[:2], strict=True))
     x, y = (each.ravel() for each in np.meshgrid(x, y))
@@ -43,7 +45,9 @@ def measure_contact(
     rest_mm: np.ndarray,
     faces: np.ndarray,
 ) -> ArrayContact:
-    """Return the contact of a transducer at a pose (4, 4) with a closed surface, vertices (v, 3) deformed and at rest [mm]."""
+    """Return the contact of a transducer at a pose (4, 4) with a closed surface, vertices (v, 3) deformed
+    and at rest [mm].
+    """
     points, area = face_points(size_mm, radius_mm)
     local = (now_mm - pose[:3, 3]) @ pose[:3, :3]
     corners = local[faces]
@@ -77,7 +81,9 @@ def measure_contact(
 
 
 def _weights(corners: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return barycentric weights (t, k, 3) of points (k, 2) in triangles (t, 3, 3) projected along z, and whether inside."""
+    """Return barycentric weights (t, k, 3) of points (k, 2) in triangles (t, 3, 3) projected along z, and
+    whether inside.
+    """
     a, b, c = (corners[:, i, :2] for i in range(3))
     twice = _cross(b - a, c - a)
     safe = np.where(np.abs(twice) < 1e-12, np.inf, twice)

@@ -1,8 +1,8 @@
 """The ultrasound beam of a probe: its profiles across the scanlines and across the image plane. NumPy.
 
-Profiles are sums of spherical waves from points of the transmit and of the receive aperture (Huygens), over frequencies of the pulse.
-The transmit aperture is focused at the focus, the receive aperture at every depth (dynamic focusing). Neither has apodization.
-Both end where the array ends.
+Profiles are sums of spherical waves from points of the transmit and of the receive aperture (Huygens), over
+frequencies of the pulse. The transmit aperture is focused at the focus, the receive aperture at every depth
+(dynamic focusing). Neither has apodization. Both end where the array ends.
 """
 
 import numpy as np
@@ -32,7 +32,9 @@ def profile_depths(probe: Probe) -> np.ndarray:
 
 
 def half_apertures_mm(probe: Probe, depth_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return half widths of the transmit and of the receive aperture at depths [mm], before the array's ends limit them."""
+    """Return half widths of the transmit and of the receive aperture at depths [mm], before the array's
+    ends limit them.
+    """
     least = MIN_APERTURE * probe.wavelength_mm
     if probe.transducer_geometry == "PHASED":
         whole = np.full(np.shape(depth_mm), probe.transducer_width_mm / 2)
@@ -42,7 +44,8 @@ def half_apertures_mm(probe: Probe, depth_mm: np.ndarray) -> tuple[np.ndarray, n
 
 
 def lateral_profiles(probe: Probe, scanline: float, depth_mm: np.ndarray, lag: np.ndarray) -> np.ndarray:
-    """Return how a scanline sees scatterers on its neighbours: amplitude (depths, lags), 1 on the scanline itself.
+    """Return how a scanline sees scatterers on its neighbours: amplitude (depths, lags), 1 on the scanline
+    itself.
 
     ``scanline`` is its index; ``lag`` are distances in scanlines, at the same depth.
     """
@@ -66,10 +69,12 @@ def lateral_profiles(probe: Probe, scanline: float, depth_mm: np.ndarray, lag: n
 
 
 def elevation_profiles(probe: Probe, depth_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the slice thickness and the correlation of speckle across the image plane at depths, each as an SD [mm].
+    """Return the slice thickness and the correlation of speckle across the image plane at depths, each as an
+    SD [mm].
 
-    The thickness is that of the two-way beam (full width at half maximum). Speckle at a distance d from the plane correlates as
-    exp(-d^2 / (2 SD^2)) in intensity; in a beam out of focus it is finer than the beam is wide (Wagner 1983).
+    The thickness is that of the two-way beam (full width at half maximum). Speckle at a distance d from the
+    plane correlates as exp(-d^2 / (2 SD^2)) in intensity; in a beam out of focus it is finer than the beam is
+    wide (Wagner 1983).
     """
     height, focus = probe.element_height_mm, probe.elevation_focus_mm
     half = np.full(len(depth_mm), height / 2)
@@ -98,7 +103,9 @@ def _nodes() -> np.ndarray:
 
 
 def _on_scanlines(probe: Probe, index: float | np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
-    """Return points (depths, indices, 2) [mm] of the image plane on scanlines, of which the indices are fractional."""
+    """Return points (depths, indices, 2) [mm] of the image plane on scanlines, of which the indices are
+    fractional.
+    """
     share, steering = (np.atleast_1d(index) + 0.5) / probe.number_of_scanlines, np.radians(probe.steering_deg)
     depth = np.asarray(depth_mm, float)[:, None]
     if probe.sector is None:
@@ -111,7 +118,8 @@ def _on_scanlines(probe: Probe, index: float | np.ndarray, depth_mm: np.ndarray)
 
 
 def _aperture(probe: Probe, scanline: float, half_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return points of an aperture around a scanline [mm] and their normals, both (depths, APERTURE_POINTS, 2).
+    """Return points of an aperture around a scanline [mm] and their normals, both (depths, APERTURE_POINTS,
+    2).
 
     It is cut off at the array's ends.
     """
@@ -139,7 +147,8 @@ def _field(
     frequency_mhz: float,
     pitch_mm: float = 0.0,
 ) -> np.ndarray:
-    """Return the field (depths, places) of an aperture (depths, APERTURE_POINTS, 2) focused at (.., 1, 2), at (depths, places, 2).
+    """Return the field (depths, places) of an aperture (depths, APERTURE_POINTS, 2) focused at (.., 1, 2), at
+    (depths, places, 2).
 
     Elements as wide as the pitch, in a soft baffle, radiate less to the side (Selfridge 1980).
     """
@@ -159,7 +168,9 @@ def _field(
 
 
 def _first_below(values: np.ndarray, limit: float) -> float:
-    """Return the fractional index at which falling values first are below a limit; the last one if they never are."""
+    """Return the fractional index at which falling values first are below a limit; the last one if they
+    never are.
+    """
     below = int(np.argmax(values < limit))
     if below == 0:
         return len(values) / 2

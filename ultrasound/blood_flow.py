@@ -1,7 +1,8 @@
-"""Blood flow at the CT's voxels: in labelled vessels by their kind and width, and in small vessels of the parenchyma. NumPy.
+"""Blood flow at the CT's voxels: in labelled vessels by their kind and width, and in small vessels of the
+parenchyma. NumPy.
 
-``blood_flow.toml`` is the table. A vessel has a parabolic profile. Its direction is that of a potential flow from, or to, its
-end far from the kidney.
+``blood_flow.toml`` is the table. A vessel has a parabolic profile. Its direction is that of a potential flow
+from, or to, its end far from the kidney.
 """
 
 import json
@@ -18,16 +19,20 @@ from sim.stored_arrays import stored
 from ultrasound.acoustics import KIDNEY, TissueVoxels, noise_of
 
 TABLE = Path(__file__).parent / "blood_flow.toml"
-# At each voxel: peak systolic velocity along the grid's axes [m/s], resistive index, and amplitude against blood in a vessel.
+# At each voxel: peak systolic velocity along the grid's axes [m/s], resistive index, and amplitude against
+# blood in a vessel.
 CHANNELS = 5
 KNOWN_KINDS = ("vein", "artery")
 KINDS = ("vessel", *KNOWN_KINDS)
 WITH_SMALL_VESSELS = ("kidney", "cortex", "medulla", "tumour")
-# Enhanced vessels without a label are of the kind of a labelled one up to this distance. Smaller bodies than this are noise.
+# Enhanced vessels without a label are of the kind of a labelled one up to this distance. Smaller bodies than
+# this are noise.
 SAME_KIND_MM, LEAST_VOXELS = 25.0, 20
-# The potential in a vessel, and the depth below the capsule, are smoothed before they are differentiated [voxels].
+# The potential in a vessel, and the depth below the capsule, are smoothed before they are differentiated
+# [voxels].
 POTENTIAL_SD, CAPSULE_SD = 1.0, 3.0
-# Half width [voxels] of the neighbourhood whose greatest distance from the wall is a vessel's radius: wider ones have plug flow.
+# Half width [voxels] of the neighbourhood whose greatest distance from the wall is a vessel's radius: wider
+# ones have plug flow.
 WIDEST = 3
 # The end of a vessel is all that is so near to its furthest voxel.
 END_MM = 1.5
@@ -44,7 +49,9 @@ def flow_table() -> dict[str, dict]:
 
 
 def pulse_share(time_s: float) -> float:
-    """Return how much of its pulsatile part the velocity has at a time: 0 at the end of diastole, 1 at the peak of systole."""
+    """Return how much of its pulsatile part the velocity has at a time: 0 at the end of diastole, 1 at the
+    peak of systole.
+    """
     phase = time_s % BEAT_S
     if phase < SYSTOLE_S:
         return float(np.sin(np.pi / 2 * phase / SYSTOLE_S) ** 2)
@@ -72,7 +79,8 @@ def _flow_of_texts(
 def blood_flow(
     labels: np.ndarray, tissue_of_label: Mapping[int, str], spacing_mm: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index (3,) of the first voxel of a box that contains all flow, and the flow in it (nx, ny, nz, CHANNELS) float32.
+    """Return the index (3,) of the first voxel of a box that contains all flow, and the flow in it (nx, ny,
+    nz, CHANNELS) float32.
 
     The kind of a vessel is its label's, or that of a labelled one nearby. The box has at least one voxel.
     """
@@ -163,10 +171,11 @@ def _distance_to_border(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
 
 
 def _potential(where: np.ndarray, away: np.ndarray, spacing_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mask of the connected vessels, and a potential in them whose gradient leads from each one's end far from the kidney.
+    """Return the mask of the connected vessels, and a potential in them whose gradient leads from each one's
+    end far from the kidney.
 
-    It is that of a flow which enters at that end, runs along the walls and is lost evenly on its way: its divergence is -1. ``away`` is the
-    distance from the kidney.
+    It is that of a flow which enters at that end, runs along the walls and is lost evenly on its way: its
+    divergence is -1. ``away`` is the distance from the kidney.
     """
     parts, count = ndimage.label(ndimage.binary_dilation(where))
     sizes = np.bincount(parts.ravel(), minlength=count + 1)

@@ -4,7 +4,8 @@
 2. ``_scatter``: the signal of scatterers, with the clutter that side lobes receive.
 3. ``_lengthen``: attenuation takes the high frequencies, so that the pulse becomes longer.
 4. ``_reflect``: the echoes of interfaces.
-5. ``spread``: the beam's width across the scanlines, electronic noise, then the envelope in dB, with gain and TGC.
+5. ``spread``: the beam's width across the scanlines, electronic noise, then the envelope in dB, with gain and
+   TGC.
 6. ``_scan_convert``: from scanlines and samples to the pixels of the image.
 """
 
@@ -36,16 +37,19 @@ from ultrasound.speckle import COMPONENTS, LEAST_WEIGHT, SIZE, UNIT, Speckle, el
 Packet = ti.types.vector(LANES, ti.f32)
 # The least amplitude that has a logarithm.
 SILENCE = 1e-9
-# Kernels that lengthen the pulse: by so many SDs, in steps of samples, with so many taps to each side, up to so many SDs.
+# Kernels that lengthen the pulse: by so many SDs, in steps of samples, with so many taps to each side, up to
+# so many SDs.
 LENGTHS, LENGTH_STEP, LENGTH_TAPS, HALF_WIDTH_SD = 33, 0.125, 10, 2.5
 GREY_STEPS = 64
 
 
 @dataclass(frozen=True)
 class Wavefront:
-    """A wavefront of a probe in the tissue at rest: around ``apex`` (3,) [mm], or, where it is flat, along ``direction`` (3,) from it.
+    """A wavefront of a probe in the tissue at rest: around ``apex`` (3,) [mm], or, where it is flat, along
+    ``direction`` (3,) from it.
 
-    At ``radius_mm`` from the apex it leaves the array. It is the reference of phases: those of images by the same one can be compared.
+    At ``radius_mm`` from the apex it leaves the array. It is the reference of phases: those of images by the
+    same one can be compared.
     """
 
     apex: np.ndarray
@@ -62,8 +66,8 @@ class Wavefront:
         return cls(apex[:3], direction, probe.radius_mm, probe.sector is None)
 
     def angle_deg(self, probe: Probe, world_from_plane: np.ndarray) -> float:
-        """Return the largest angle between it and the scanlines of a pose, halfway down: a phase that turns along them would be another
-        frequency.
+        """Return the largest angle between it and the scanlines of a pose, halfway down: a phase that turns
+        along them would be another frequency.
         """
         start, direction = probe.scanlines()
         place = (start + probe.depth_mm / 2 * direction) @ world_from_plane[:3, :2].T + world_from_plane[
@@ -78,7 +82,9 @@ class Wavefront:
 
 
 class BMode:
-    """B-mode images of the image plane that sound propagates through, for probes with the same numbers of scanlines and samples."""
+    """B-mode images of the image plane that sound propagates through, for probes with the same numbers of
+    scanlines and samples.
+    """
 
     def __init__(self, sound: Propagation, probe: Probe) -> None:
         self.sound, self.plane, self.speckle = sound, sound.plane, Speckle()
@@ -115,7 +121,8 @@ class BMode:
         self.covered = np.zeros(self.plane.shape, bool)
 
     def render(self, probe: Probe, detail_level: DetailLevel = "speckle") -> np.ndarray:
-        """Return grey values (rows, columns) uint8 of the plane located last, for a probe with the same numbers of scanlines and samples.
+        """Return grey values (rows, columns) uint8 of the plane located last, for a probe with the same
+        numbers of scanlines and samples.
 
         ``decibel`` then holds its scanlines, ``real`` and ``imaginary`` their echo.
         """
@@ -141,16 +148,19 @@ class BMode:
         return self.scan_converted(probe)
 
     def scan_converted(self, probe: Probe) -> np.ndarray:
-        """Return grey values (rows, columns) uint8 of ``decibel``, for the settings of the probe rendered last."""
+        """Return grey values (rows, columns) uint8 of ``decibel``, for the settings of the probe rendered
+        last.
+        """
         image = np.empty(self.plane.shape, np.uint8)
         self._scan_convert(probe.dyn_range_db, image)
         return image
 
     def iq_of_last(self, probe: Probe, wavefront: Wavefront) -> tuple[np.ndarray, np.ndarray]:
-        """Return the IQ signal (scanlines, samples) complex64 of the image rendered last, and rest positions (.., 3) [mm] of its samples.
+        """Return the IQ signal (scanlines, samples) complex64 of the image rendered last, and rest positions
+        (.., 3) [mm] of its samples.
 
-        Its phase is that of the carrier: it turns with the distance of the tissue from the array, so that motion can be measured.
-        ``real``, ``imaginary`` and ``decibel`` stay as they are.
+        Its phase is that of the carrier: it turns with the distance of the tissue from the array, so that
+        motion can be measured. ``real``, ``imaginary`` and ``decibel`` stay as they are.
         """
         signal = self.real, self.imaginary, self.decibel
         before = [array_of(each) for each in signal]
@@ -296,7 +306,9 @@ class BMode:
 
     @kernel
     def _lengthen(self, stride: ti.template(), speckle_sd: float, sample_mm: float):
-        """Lengthen the pulse as attenuation on the path has done, and scale speckle for the spread that follows."""
+        """Lengthen the pulse as attenuation on the path has done, and scale speckle for the spread that
+        follows.
+        """
         for packet, line in ti.ndrange(self.samples // LANES, self.lines):
             first = packet * LANES
             path = self.reverberation.path[line, (first + LANES // 2) // stride]
@@ -416,7 +428,9 @@ class BMode:
 
     @kernel
     def spread(self, noise: float, key: int, keeps: ti.template()):
-        """Spread the scanlines as the beam is wide, add electronic noise, and take the envelope in dB; keep the signal or not."""
+        """Spread the scanlines as the beam is wide, add electronic noise, and take the envelope in dB;
+        keep the signal or not.
+        """
         # Scanline by scanline at one depth: the samples that neighbours share stay in the L1 cache.
         for packet, line in ti.ndrange(self.samples // LANES, self.lines):
             first = packet * LANES
@@ -448,7 +462,9 @@ class BMode:
 
     @ti.func
     def electronic_noise(self, line, packet, key):
-        """Return noise (2, LANES) of unit mean square, which changes with the key; as long as the pulse, but on one scanline."""
+        """Return noise (2, LANES) of unit mean square, which changes with the key; as long as the pulse,
+        but on one scanline.
+        """
         rows, packets = ti.static(SIZE * SIZE, SIZE // LANES)
         row = (line * 3 + (line // 21) * 320 + (packet // packets) * 448 + key) & (rows - 1)
         at = row * SIZE + (packet % packets) * LANES
@@ -490,7 +506,9 @@ class BMode:
 
 
 def source_of_pixels(probe: Probe, rows: int, columns: int) -> np.ndarray:
-    """Return scanline and sample index, fractional, of each pixel's centre, (rows, columns, 2) float32; -1 outside the image."""
+    """Return scanline and sample index, fractional, of each pixel's centre, (rows, columns, 2) float32; -1
+    outside the image.
+    """
     width, depth, above = probe.extent_mm
     u = (np.arange(columns) + 0.5) / columns * width - width / 2
     v = (np.arange(rows) + 0.5) / rows * depth - above
@@ -510,7 +528,8 @@ def padded_source(probe: Probe, shape: tuple[int, int], most: tuple[int, ...]) -
 
 
 def length_weights(pulse_sd: float) -> np.ndarray:
-    """Return kernels (LENGTHS, 2 LENGTH_TAPS + 1) that lengthen noise of a correlation SD, by SDs of LENGTH_STEP each, in samples.
+    """Return kernels (LENGTHS, 2 LENGTH_TAPS + 1) that lengthen noise of a correlation SD, by SDs of
+    LENGTH_STEP each, in samples.
 
     They preserve the mean square.
     """

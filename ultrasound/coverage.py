@@ -1,6 +1,7 @@
 """Coverage: which tissue of the organ has been imaged, by its rest position.
 
-A voxel counts as imaged where a scanline of an element in contact passed through it. Acoustic shadows are not considered.
+A voxel counts as imaged where a scanline of an element in contact passed through it. Acoustic shadows are not
+considered.
 """
 
 from collections.abc import Iterator
@@ -36,9 +37,11 @@ class Gap:
 
 
 class Coverage:
-    """``seen`` (nx, ny, nz): voxels of the organ at rest, and around it, that were imaged; ``targets``: those of each target.
+    """``seen`` (nx, ny, nz): voxels of the organ at rest, and around it, that were imaged; ``targets``: those
+    of each target.
 
-    ``organ`` and ``tumour`` are closed surfaces at rest [mm]; ``margin_mm`` is the width of the margin around the tumour.
+    ``organ`` and ``tumour`` are closed surfaces at rest [mm]; ``margin_mm`` is the width of the margin around
+    the tumour.
     """
 
     def __init__(
@@ -74,8 +77,9 @@ class Coverage:
     def add(self, rest_mm: np.ndarray, probe: Probe, gap_mm: float | None) -> np.ndarray:
         """Add an image; return which of its scanlines are in contact.
 
-        ``rest_mm`` (n, n, 3) are rest positions at points evenly over the image (``PlaneInTissue.rest_grid``). A scanline is in
-        contact where its element is nearer to the organ than ``gap_mm``; without it, all are.
+        ``rest_mm`` (n, n, 3) are rest positions at points evenly over the image
+        (``PlaneInTissue.rest_grid``). A scanline is in contact where its element is nearer to the organ than
+        ``gap_mm``; without it, all are.
         """
         count = len(rest_mm)
         lines, in_image = _scanlines_of(probe, count)
@@ -130,7 +134,9 @@ class Coverage:
 
 @lru_cache(maxsize=4)
 def _scanlines_of(probe: Probe, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the scanline of each of count x count points of an image, and whether the point is in the sector."""
+    """Return the scanline of each of count x count points of an image, and whether the point is in the
+    sector.
+    """
     width, depth, above = probe.extent_mm
     share = np.linspace(0.0, 1.0, count)
     line, along = probe.beam_coordinates(*np.meshgrid(width * (share - 0.5), depth * share - above))
@@ -141,7 +147,8 @@ def _scanlines_of(probe: Probe, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _subdivisions(at: np.ndarray, shown: np.ndarray, probe: Probe, count: int) -> Iterator[np.ndarray]:
-    """Yield centres (3, n) of the parts, no larger than a voxel, into which the box of tissue around each grid point is divided.
+    """Yield centres (3, n) of the parts, no larger than a voxel, into which the box of tissue around each
+    grid point is divided.
 
     ``at`` (3, count * count) are the rest positions of all points [voxels], ``shown`` the points to use.
     """

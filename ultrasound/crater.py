@@ -14,10 +14,12 @@ from ultrasound.sampled_volume import AIR_HU, SampledVolume
 
 Filling = Literal["fluid", "air"]
 FILLINGS: tuple[Filling, ...] = get_args(Filling)
-# HU of each, and the tissue whose acoustic values it has, where it has a tissue's: irrigation fluid with some blood is as urine.
+# HU of each, and the tissue whose acoustic values it has, where it has a tissue's: irrigation fluid with some
+# blood is as urine.
 HU: dict[Filling, float] = {"fluid": 10.0, "air": AIR_HU}
 TISSUE: dict[Filling, str] = {"fluid": "urine"}
-# Voxels that a surface crosses are shared by the distance to it, interpolated on a grid of the first spacing up to the second.
+# Voxels that a surface crosses are shared by the distance to it, interpolated on a grid of the first spacing
+# up to the second.
 FINE_MM, NEAR_MM = 0.6, 3.0
 Box = tuple[slice, slice, slice]
 
@@ -42,7 +44,9 @@ class Crater:
 
     @cached_property
     def _distances(self) -> tuple[np.ndarray, np.ndarray]:
-        """Signed distances [mm] from the surface on a fine grid, up to NEAR_MM, and the grid's first point (3,)."""
+        """Signed distances [mm] from the surface on a fine grid, up to NEAR_MM, and the grid's first point
+        (3,).
+        """
         low = self.surface.bounds[0] - NEAR_MM
         shape = tuple(np.ceil((self.surface.bounds[1] + NEAR_MM - low) / FINE_MM).astype(int) + 1)
         given = self.surface.vertices, self.surface.faces, low, shape, FINE_MM, NEAR_MM
@@ -59,7 +63,9 @@ class Crater:
         return box, (index - offset) @ np.linalg.inv(linear).T  # type: ignore[return-value]
 
     def replaced(self, volume: SampledVolume, value: np.ndarray) -> tuple[Box, np.ndarray]:
-        """Voxels of a volume, and their values with another value in the crater, by the share of each voxel that is in it."""
+        """Voxels of a volume, and their values with another value in the crater, by the share of each
+        voxel that is in it.
+        """
         box, places = self._voxels(volume)
         fine, low = self._distances
         at = np.moveaxis((places - low) / FINE_MM, -1, 0)
@@ -70,7 +76,9 @@ class Crater:
         return box, before + share * (value - before)
 
     def without(self, volume: SampledVolume) -> tuple[Box, np.ndarray]:
-        """Voxels of a volume of signed distances [mm], and these without the crater: negative in what remains."""
+        """Voxels of a volume of signed distances [mm], and these without the crater: negative in what
+        remains.
+        """
         box, places = self._voxels(volume)
         given = self.surface.vertices, self.surface.faces, places.reshape(-1, 3)
         distance = signed_distance(*given)[0].reshape(places.shape[:3])

@@ -1,4 +1,6 @@
-"""Images as de-identified DICOM Ultrasound Images (PS3.3 A.6.4, with the US modules of C.8.5.5 and C.8.5.6)."""
+"""Images as de-identified DICOM Ultrasound Images (PS3.3 A.6.4, with the US modules of C.8.5.5 and
+C.8.5.6).
+"""
 
 import io
 from pathlib import Path
@@ -35,10 +37,11 @@ REGION_2D, REGION_TISSUE, REGION_COLOUR_FLOW, CENTIMETRES = 1, 1, 2, 3
 def save_dicom(
     path: Path, image: np.ndarray, spacing_mm: tuple[float, float], probe: Probe | None = None
 ) -> None:
-    """Write grey values (rows, columns) uint8, or colours (rows, columns, 3) of Doppler, with row and column spacing [mm].
+    """Write grey values (rows, columns) uint8, or colours (rows, columns, 3) of Doppler, with row and column
+    spacing [mm].
 
-    With a probe, whose ``extent_mm`` the image covers, the file also has transducer data and the centre of the array face.
-    Raises OSError where the file cannot be written.
+    With a probe, whose ``extent_mm`` the image covers, the file also has transducer data and the centre of
+    the array face. Raises OSError where the file cannot be written.
     """
     data = Dataset()
     for keyword in EMPTY:
@@ -76,7 +79,9 @@ def save_dicom(
 
 
 def _region(shape: tuple[int, ...], spacing_mm: tuple[float, float], probe: Probe | None) -> Dataset:
-    """Return the whole image as one region; its reference pixel contains the centre of the face, where (u, v) is 0 [cm]."""
+    """Return the whole image as one region; its reference pixel contains the centre of the face, where (u,
+    v) is 0 [cm].
+    """
     rows, columns = shape[:2]
     row_cm, column_cm = (float(each) / 10 for each in spacing_mm)
     region = Dataset()

@@ -1,8 +1,10 @@
-"""Colour and power Doppler: the mean velocity towards the array, or the energy, of moving blood, over the B-mode image.
+"""Colour and power Doppler: the mean velocity towards the array, or the energy, of moving blood, over the
+B-mode image.
 
-Of each sample of a scanline, the autocorrelation of the echoes of successive pulses is computed from the moments of what moves there,
-not from the pulses themselves (Kasai et al. 1985, IEEE Trans Sonics Ultrason 32, 458): its phase is that of the velocity, which
-aliases; a wall filter removes what is slow; the sample volume averages it; noise is that of so many pulses.
+Of each sample of a scanline, the autocorrelation of the echoes of successive pulses is computed from the
+moments of what moves there, not from the pulses themselves (Kasai et al. 1985, IEEE Trans Sonics Ultrason 32,
+458): its phase is that of the velocity, which aliases; a wall filter removes what is slow; the sample volume
+averages it; noise is that of so many pulses.
 """
 
 import zlib
@@ -23,7 +25,8 @@ from ultrasound.pulse import DB_OF_NEPER, SOUND_MM_US
 from ultrasound.sampled_volume import SampledVolume
 from ultrasound.speckle import SIZE
 
-# Pulses of one estimate. The noise of its band, and of these pulses, is so much below that of the B-mode image [dB].
+# Pulses of one estimate. The noise of its band, and of these pulses, is so much below that of the B-mode
+# image [dB].
 ENSEMBLE, NARROW_BAND_DB = 10, 6.0
 # Length of the sample volume along the beam [mm].
 GATE_MM = 1.0
@@ -41,7 +44,8 @@ STOPPED = 2e-9
 CLAMP_MM = 5.0
 # Scanlines from one independent value of noise to the next.
 NOISE_LINES = 3.0
-# Colours from no velocity to the limit of the scale, towards the array and away from it; and from no power to the most.
+# Colours from no velocity to the limit of the scale, towards the array and away from it; and from no power to
+# the most.
 TOWARDS = np.array([[70, 0, 0], [205, 20, 10], [255, 150, 20], [255, 245, 120]], np.float32)
 AWAY = np.array([[0, 0, 80], [20, 60, 205], [40, 160, 255], [150, 250, 255]], np.float32)
 POWER = np.array([[60, 10, 20], [190, 50, 10], [250, 150, 30], [255, 240, 170]], np.float32)
@@ -62,11 +66,13 @@ def scale_colours(mode: DopplerMode) -> np.ndarray:
 
 
 class Doppler:
-    """Doppler images of the plane of a B-mode image, along the scanlines of ``sound``: its own or, where they are steered, others.
+    """Doppler images of the plane of a B-mode image, along the scanlines of ``sound``: its own or, where they
+    are steered, others.
 
-    ``flow`` (.., 5) has velocity [m/s] along the rest axes at the peak of systole, resistive index and amplitude of blood
-    (``blood_flow.blood_flow``). ``moment`` (scanlines, samples) has, at the tissue samples, real and imaginary part of the
-    autocorrelation, and the energy; ``mean`` is that of the sample volume, with noise.
+    ``flow`` (.., 5) has velocity [m/s] along the rest axes at the peak of systole, resistive index and
+    amplitude of blood (``blood_flow.blood_flow``). ``moment`` (scanlines, samples) has, at the tissue
+    samples, real and imaginary part of the autocorrelation, and the energy; ``mean`` is that of the sample
+    volume, with noise.
     """
 
     def __init__(self, sound: Propagation, bmode: BMode, flow: SampledVolume) -> None:
@@ -84,10 +90,11 @@ class Doppler:
     def render(
         self, probe: Probe, grey: np.ndarray, mode: DopplerMode, time_s: float = 0.0, clamped: bool = False
     ) -> np.ndarray:
-        """Return an image (rows, columns, 3) uint8: a B-mode image ``grey`` of the plane, with Doppler over it.
+        """Return an image (rows, columns, 3) uint8: a B-mode image ``grey`` of the plane, with Doppler over
+        it.
 
-        The B-mode image must have been rendered last for the same probe. ``time_s`` is that of the heart. Blood of a clamped kidney rests;
-        beyond the clamp it flows on.
+        The B-mode image must have been rendered last for the same probe. ``time_s`` is that of the heart.
+        Blood of a clamped kidney rests; beyond the clamp it flows on.
         """
         self.estimate(probe, time_s, clamped)
         power = mode == "power"
@@ -114,7 +121,9 @@ class Doppler:
         self._average(count, gate, noise_energy(probe), float(ENSEMBLE) ** -0.5, key)
 
     def estimate_of(self, probe: Probe, moment: np.ndarray) -> None:
-        """Compute ``mean`` from moments (scanlines, tissue samples, 3) of echoes (``autocorrelation``), which have their own noise."""
+        """Compute ``mean`` from moments (scanlines, tissue samples, 3) of echoes (``autocorrelation``),
+        which have their own noise.
+        """
         self._make_tables(self._steered(probe))
         fill((self.moment, moment.astype(np.float32)))
         self._average(*self._sample_volume(probe), 0.0, 0.0, 0)
@@ -157,7 +166,9 @@ class Doppler:
 
     @kernel
     def _find_flow(self, count: int, clamped: int, systole: float, limit: float, wall: float):
-        """Set ``moment`` at each tissue sample: that of moving blood, behind the wall filter, and what is left of tissue."""
+        """Set ``moment`` at each tissue sample: that of moving blood, behind the wall filter, and what is
+        left of tissue.
+        """
         for line, k in ti.ndrange(self.lines, count):
             flow = self.flow.sample(self.sound.rest[line, k])
             amplitude = self.sound.amplitude[line, k]
@@ -179,7 +190,8 @@ class Doppler:
 
     @ti.func
     def towards_array(self, line, k, velocity):
-        """Return the component towards the array of a velocity along the rest axes, carried by the deformed tissue.
+        """Return the component towards the array of a velocity along the rest axes, carried by the deformed
+        tissue.
 
         The tissue turns the velocity; its size stays.
         """
@@ -258,10 +270,11 @@ class Doppler:
 
 
 def autocorrelation(iq: np.ndarray) -> np.ndarray:
-    """Return the moments (.., 3) of the echoes (.., pulses) of successive pulses: real and imaginary part of the autocorrelation from
-    one pulse to the next, and the energy (Kasai et al. 1985).
+    """Return the moments (.., 3) of the echoes (.., pulses) of successive pulses: real and imaginary part of
+    the autocorrelation from one pulse to the next, and the energy (Kasai et al. 1985).
 
-    Of a signal whose phase grows as the echo comes earlier, as demodulated by exp(-i w t), the phase is that of a velocity towards the array.
+    Of a signal whose phase grows as the echo comes earlier, as demodulated by exp(-i w t), the phase is that
+    of a velocity towards the array.
     """
     lagged = (iq[..., 1:] * iq[..., :-1].conj()).mean(axis=-1)
     return np.stack([lagged.real, lagged.imag, (np.abs(iq) ** 2).mean(axis=-1)], axis=-1)
@@ -279,6 +292,8 @@ def doppler_shift_khz(probe: Probe, velocity_cm_s: float) -> float:
 
 @ti.func
 def passed_by_wall_filter(share):
-    """Energy that the wall filter lets pass of a velocity, in units of its limit: a Butterworth high-pass of fourth order."""
+    """Energy that the wall filter lets pass of a velocity, in units of its limit: a Butterworth high-pass
+    of fourth order.
+    """
     eighth = share**8
     return eighth / (1.0 + eighth)

@@ -15,8 +15,8 @@ MAX_BEADS = 255 // PixelLabel.BEAD
 class GroundTruthLabels:
     """``PixelLabel`` values of the plane located last, by the rest position of its tissue.
 
-    ``organ`` and ``tumour`` are signed distances [mm], negative inside; ``beads`` (n, 3) are centres of balls of a radius [mm].
-    Raises ValueError for more than MAX_BEADS beads.
+    ``organ`` and ``tumour`` are signed distances [mm], negative inside; ``beads`` (n, 3) are centres of balls
+    of a radius [mm]. Raises ValueError for more than MAX_BEADS beads.
     """
 
     def __init__(

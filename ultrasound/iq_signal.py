@@ -1,4 +1,5 @@
-"""IQ and RF signals of the scanlines of an image, with the position of the tissue at each sample: for developers of algorithms. NumPy.
+"""IQ and RF signals of the scanlines of an image, with the position of the tissue at each sample: for
+developers of algorithms. NumPy.
 
 Names and axes as in USTB and MUST: depth along the columns, one column for each scanline.
 """
@@ -23,9 +24,9 @@ RF_PER_PERIOD = 4
 class IQSignal:
     """Signals of one image before gain; 1 is the echo of a perfect reflector at the face.
 
-    ``rest_mm`` is where the tissue of each sample is in the CT (LPS): of two images, samples with the same position show the same
-    scatterers. ``motion_mm`` is how these moved on the image plane since the image before (u, v, and w out of the plane); zero for the
-    first.
+    ``rest_mm`` is where the tissue of each sample is in the CT (LPS): of two images, samples with the same
+    position show the same scatterers. ``motion_mm`` is how these moved on the image plane since the image
+    before (u, v, and w out of the plane); zero for the first.
     """
 
     iq: np.ndarray
@@ -60,7 +61,9 @@ def iq_signal(
     before: ImagePlane | None,
     phase_reference: int = 0,
 ) -> IQSignal:
-    """Return the signals of IQ (scanlines, samples) of tissue at rest positions (scanlines, samples, 3) [mm]."""
+    """Return the signals of IQ (scanlines, samples) of tissue at rest positions (scanlines, samples, 3)
+    [mm].
+    """
     iq, rest_mm = iq.T.astype(np.complex64), np.swapaxes(rest_mm, 0, 1)
     rf, rf_sampling_mhz = rf_of(iq, probe)
     start, direction = probe.scanlines()
@@ -83,7 +86,9 @@ def iq_signal(
 
 
 def rf_of(iq: np.ndarray, probe: Probe) -> tuple[np.ndarray, float]:
-    """Return the RF signal (RF samples, scanlines) float32 of IQ (samples, scanlines), and its sampling frequency [MHz]."""
+    """Return the RF signal (RF samples, scanlines) float32 of IQ (samples, scanlines), and its sampling
+    frequency [MHz].
+    """
     duration_us = 2 * probe.depth_mm / SOUND_MM_US
     count = round(RF_PER_PERIOD * probe.frequency_mhz * duration_us)
     envelope = scipy.signal.resample(iq, count, axis=0)

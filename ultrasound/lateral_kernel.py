@@ -32,8 +32,9 @@ def packet_depths(probe: Probe) -> np.ndarray:
 def lateral_kernel(probe: Probe) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the weights of neighbouring scanlines for each class of scanlines and LANES samples.
 
-    Weights (CLASSES, packets, 2 MAX_HALF_WIDTH + 1), of sum 1; the half width in scanlines (CLASSES, packets); and the speckle gain
-    (CLASSES, packets), which restores unit mean square of noise with the pulse's correlation.
+    Weights (CLASSES, packets, 2 MAX_HALF_WIDTH + 1), of sum 1; the half width in scanlines (CLASSES,
+    packets); and the speckle gain (CLASSES, packets), which restores unit mean square of noise with the
+    pulse's correlation.
     """
     depth, lag = packet_depths(probe), np.arange(-MAX_HALF_WIDTH, MAX_HALF_WIDTH + 1)
     # The noise already has the width of the pulse in every direction.
@@ -54,7 +55,9 @@ def lateral_kernel(probe: Probe) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def narrowed(profile: np.ndarray, pulse_sd: float) -> np.ndarray:
-    """Return the kernel that makes noise of an SD [scanlines] as wide as a profile (2 n + 1,), as far as that is possible."""
+    """Return the kernel that makes noise of an SD [scanlines] as wide as a profile (2 n + 1,), as far as
+    that is possible.
+    """
     lag = np.arange(len(profile)) - len(profile) // 2
     fine = np.linspace(lag[0], lag[-1], 20 * len(lag))
     width = np.ptp(fine[np.interp(fine, lag, profile) >= 0.5 * profile.max()]) / FWHM_OF_SD
@@ -71,7 +74,8 @@ def _profiles(probe: Probe, each: int, lag: np.ndarray, depth_mm: np.ndarray) ->
 
 
 def clutter_weights(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
-    """Return the energy that side lobes receive from groups of GROUP scanlines beside a scanline's group, (depths, 2 groups - 1).
+    """Return the energy that side lobes receive from groups of GROUP scanlines beside a scanline's group,
+    (depths, 2 groups - 1).
 
     Relative to the energy within the kernel, of a scanline in the middle; nothing within the kernel.
     """
@@ -79,7 +83,8 @@ def clutter_weights(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
     nodes, middle = profile_depths(probe), (probe.number_of_scanlines - 1) / 2
     near = np.arange(-MAX_HALF_WIDTH, MAX_HALF_WIDTH + 1)
     main = (lateral_profiles(probe, middle, nodes, near) ** 2).sum(axis=1)
-    # Side lobes of a pulse are smooth and, in the middle, the same on both sides: every second scanline stands for both.
+    # Side lobes of a pulse are smooth and, in the middle, the same on both sides: every second scanline
+    # stands for both.
     beyond = np.arange(MAX_HALF_WIDTH // GROUP, groups)
     lag = (GROUP * beyond[:, None] + np.arange(1, GROUP, 2) - GROUP // 2).ravel()
     energy = lateral_profiles(probe, middle, nodes, lag) ** 2 * (lag > MAX_HALF_WIDTH)

@@ -1,4 +1,6 @@
-"""Sweeps as NRRD sequences (.igs.nrrd), as PLUS writes them: fields ``name: value`` and ``name:=value``, an empty line, the pixels."""
+"""Sweeps as NRRD sequences (.igs.nrrd), as PLUS writes them: fields ``name: value`` and ``name:=value``,
+an empty line, the pixels.
+"""
 
 import gzip
 import os
@@ -27,9 +29,12 @@ METAFILE_NAMES = {ORIENTATION: "UltrasoundImageOrientation", "ultrasound image t
 STATUS, METAFILE_STATUS = "Status", "ImageStatus"
 # Fields of the format, which other formats have in their own way; PLUS writes the user's fields like these.
 FORMAT_FIELDS = frozenset(
-    "dimension, type, block size, blocksize, encoding, endian, content, min, max, old min, oldmin, old max, oldmax, data file, "
-    "datafile, line skip, lineskip, byte skip, byteskip, number, sample units, sampleunits, sizes, spacings, thicknesses, axis mins, "
-    "axismins, axis maxs, axismaxs, centers, centerings, labels, units, kinds, space, space dimension, space units, space origin, "
+    "dimension, type, block size, blocksize, encoding, endian, content, min, max, old min, oldmin, "
+    "old max, oldmax, data file, "
+    "datafile, line skip, lineskip, byte skip, byteskip, number, sample units, sampleunits, sizes, "
+    "spacings, thicknesses, axis mins, "
+    "axismins, axis maxs, axismaxs, centers, centerings, labels, units, kinds, space, space "
+    "dimension, space units, space origin, "
     "space directions, measurement frame".split(", ")
 )
 TYPES = ("uint8", "uchar", "unsigned char", "uint8_t")
@@ -107,7 +112,9 @@ def _renamed(fields: Mapping[str, str], names: Mapping[str, str]) -> dict[str, s
 
 
 def _read_header(file: BinaryIO) -> tuple[dict[str, str], dict[str, str], FrameFields]:
-    """The fields of the format, the others, and those of each frame by number; leave the file at the pixels."""
+    """The fields of the format, the others, and those of each frame by number; leave the file at the
+    pixels.
+    """
     fields: dict[str, str] = {}
     own: dict[str, str] = {}
     frames: FrameFields = {}
@@ -128,7 +135,10 @@ def _read_header(file: BinaryIO) -> tuple[dict[str, str], dict[str, str], FrameF
 
 
 def _lines(file: BinaryIO) -> Iterator[tuple[int, str]]:
-    """Place and text of each line between the first and the empty one. Raises SweepError where the header has no end."""
+    """Place and text of each line between the first and the empty one.
+
+    Raises SweepError where the header has no end.
+    """
     end = "\r\n" if file.readline(HEADER_LIMIT).endswith(b"\r\n") else "\n"
     while True:
         start = file.tell()

@@ -1,4 +1,6 @@
-"""The image plane in deformed tissue: which tetrahedron contains each pixel, and where its tissue was at rest."""
+"""The image plane in deformed tissue: which tetrahedron contains each pixel, and where its tissue was at
+rest.
+"""
 
 import zlib
 
@@ -14,7 +16,8 @@ from ultrasound.sampled_volume import LANES, Lanes
 
 
 class PlaneInTissue:
-    """The tetrahedron of an embedding that contains each pixel of an image plane, which has at most ``pixels`` x ``pixels``.
+    """The tetrahedron of an embedding that contains each pixel of an image plane, which has at most
+    ``pixels`` x ``pixels``.
 
     Since the last ``locate``, number ``location``, the image has ``shape`` (rows, columns), ``owner`` is the
     tetrahedron's index at these, ``grid`` the size of a pixel and the centre (u, v) of the first one [mm].
@@ -65,7 +68,10 @@ class PlaneInTissue:
         return tm.vec2(*pixel), tm.vec2(*first)
 
     def rest_grid(self, count: int) -> np.ndarray:
-        """Return rest positions (count, count, 3) [mm] at pixels evenly over the plane, whatever the shape. They are not to be changed."""
+        """Return rest positions (count, count, 3) [mm] at pixels evenly over the plane, whatever the shape.
+
+        They are not to be changed.
+        """
         if count not in self._rest_grids:
             self._rest_grids[count] = np.empty((count, count, 3), np.float32)
             pixel, first = self._whole

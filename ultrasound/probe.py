@@ -1,7 +1,8 @@
 """The array of a probe and the scanner's settings: probe files and scanline geometry.
 
-A probe file is TOML with PLUS's names (TransducerGeometry, DepthMm, FrequencyMhz, ...), each with its unit. Points on the image
-plane are (u, v) [mm]: u to the marked side, v down into the tissue, the origin at the centre of the array face.
+A probe file is TOML with PLUS's names (TransducerGeometry, DepthMm, FrequencyMhz, ...), each with its unit.
+Points on the image plane are (u, v) [mm]: u to the marked side, v down into the tissue, the origin at the
+centre of the array face.
 """
 
 from collections.abc import Mapping
@@ -21,17 +22,20 @@ GAIN_RANGE_DB, TGC_RANGE_DB, TGC_SLIDERS = 60.0, 24.0, 8
 
 Mode = Literal["both", "b-mode", "ct"]
 MODES: tuple[Mode, ...] = get_args(Mode)
-# Realism of the B-mode image: reflection and attenuation; also speckle and point spread; also the slice thickness.
+# Realism of the B-mode image: reflection and attenuation; also speckle and point spread; also the slice
+# thickness.
 DetailLevel = Literal["reflection", "speckle", "elevation"]
 DETAIL_LEVELS: tuple[DetailLevel, ...] = get_args(DetailLevel)
 
 DopplerMode = Literal["off", "colour", "power"]
 DOPPLER_MODES: tuple[DopplerMode, ...] = get_args(DopplerMode)
 
-# Grey values: the exponent of the share of the dynamic range. On a scanner's screen most of the tissue is dark.
+# Grey values: the exponent of the share of the dynamic range. On a scanner's screen most of the tissue is
+# dark.
 GreyMap = Literal["linear", "dark"]
 GREY_EXPONENTS: dict[GreyMap, float] = {"linear": 1.0, "dark": 3.5}
-# How much weaker harmonics are, where they have built up; and the depth at which they have half of that amplitude. An estimate.
+# How much weaker harmonics are, where they have built up; and the depth at which they have half of that
+# amplitude. An estimate.
 HARMONIC_LOSS_DB, BUILD_UP_MM = 15.0, 12.0
 # Range of the angles of spatial compounding.
 COMPOUND_RANGE_DEG = 24.0
@@ -54,18 +58,23 @@ class ProbeError(UserError):
 
 
 class Probe(BaseModel):
-    """One probe with the scanner's settings, as its file has them in PLUS's spelling (``frequency_mhz`` is FrequencyMhz).
+    """One probe with the scanner's settings, as its file has them in PLUS's spelling (``frequency_mhz`` is
+    FrequencyMhz).
 
-    ``housing_mm`` is the cuboid in contact: lateral x elevation x length. ``edge_radius_mm`` rounds its edges; sharp ones cut into
-    tissue that they slide over. ``f_number`` is that of the transmit and of the receive aperture. ``element_height_mm`` and the
-    lens, focused at ``elevation_focus_mm``, shape the beam across the image plane; ``elevation_width_mm`` is the slice thickness
-    that counts as scanned (coverage). ``bandwidth_percent`` is the -6 dB width of a round trip through the array, relative to the
-    frequency. ``noise_db`` is the scanner's electronic noise before gain; 0 dB is the echo of a perfect reflector at the face. Its default gives
-    the penetration of laparoscopic probes, 6 to 8 cm at 7.5 MHz, in wavelengths the same for others.
-    ``ringing_db`` is the array's own vibration there, which dies down in the near field.
-    ``harmonics`` receives at ``frequency_mhz`` what arises in tissue from half of it. ``compound_angles`` images, steered by different
-    angles, are averaged. ``steering_deg`` turns the scanlines from the face's normal towards +u, ``colour_steering_deg`` those of Doppler on a linear array. ``velocity_scale_cm_s`` is the greatest velocity that Doppler
-    shows without aliasing, ``wall_filter_cm_s`` the least. ``depth_compensation_db_cm_mhz`` is the attenuation that the scanner's built-in TGC compensates, to which the sliders of ``time_gain_compensation`` [%] add.
+    ``housing_mm`` is the cuboid in contact: lateral x elevation x length. ``edge_radius_mm`` rounds its
+    edges; sharp ones cut into tissue that they slide over. ``f_number`` is that of the transmit and of the
+    receive aperture. ``element_height_mm`` and the lens, focused at ``elevation_focus_mm``, shape the beam
+    across the image plane; ``elevation_width_mm`` is the slice thickness that counts as scanned (coverage).
+    ``bandwidth_percent`` is the -6 dB width of a round trip through the array, relative to the frequency.
+    ``noise_db`` is the scanner's electronic noise before gain; 0 dB is the echo of a perfect reflector at the
+    face. Its default gives the penetration of laparoscopic probes, 6 to 8 cm at 7.5 MHz, in wavelengths the
+    same for others. ``ringing_db`` is the array's own vibration there, which dies down in the near field.
+    ``harmonics`` receives at ``frequency_mhz`` what arises in tissue from half of it. ``compound_angles``
+    images, steered by different angles, are averaged. ``steering_deg`` turns the scanlines from the face's
+    normal towards +u, ``colour_steering_deg`` those of Doppler on a linear array. ``velocity_scale_cm_s`` is
+    the greatest velocity that Doppler shows without aliasing, ``wall_filter_cm_s`` the least.
+    ``depth_compensation_db_cm_mhz`` is the attenuation that the scanner's built-in TGC compensates, to which
+    the sliders of ``time_gain_compensation`` [%] add.
     """
 
     model_config = ConfigDict(
@@ -116,7 +125,8 @@ class Probe(BaseModel):
     def _fits_together(self) -> "Probe":
         if self.edge_radius_mm > min(self.housing_mm) / 2:
             raise ValueError(
-                f"EdgeRadiusMm = {self.edge_radius_mm:g}: expected at most half of the least of HousingMm, {min(self.housing_mm) / 2:g}"
+                f"EdgeRadiusMm = {self.edge_radius_mm:g}: expected at most half of the least of HousingMm, "
+                f"{min(self.housing_mm) / 2:g}"
             )
         low, high = self.frequency_range_mhz
         if not 1 <= low <= self.frequency_mhz <= high <= 40:
@@ -129,12 +139,14 @@ class Probe(BaseModel):
             raise ValueError("a curvilinear array needs its radius: RadiusStartMm > 0")
         if self.transducer_geometry == "PHASED" and (self.steering_deg or self.compound_angles > 1):
             raise ValueError(
-                f"SteeringDeg = {self.steering_deg:g}, CompoundAngles = {self.compound_angles}: the sector of a phased array is steered "
+                f"SteeringDeg = {self.steering_deg:g}, CompoundAngles = {self.compound_angles}: the sector "
+                "of a phased array is steered "
                 "already; expected 0 and 1"
             )
         if self.transducer_geometry != "LINEAR" and self.colour_steering_deg:
             raise ValueError(
-                f"ColourSteeringDeg = {self.colour_steering_deg:g}: only linear arrays steer Doppler; expected 0"
+                f"ColourSteeringDeg = {self.colour_steering_deg:g}: only linear arrays steer Doppler; "
+                "expected 0"
             )
         array = np.ptp(self.elements()[:, 0])
         if array > self.housing_mm[0]:
@@ -202,7 +214,9 @@ class Probe(BaseModel):
 
     @property
     def velocity_limit_cm_s(self) -> float:
-        """The scale of velocity, or less where echoes of the whole depth must return before the next pulse."""
+        """The scale of velocity, or less where echoes of the whole depth must return before the next
+        pulse.
+        """
         pulse_mhz = SOUND_MM_US / (2 * self.depth_mm)
         most = SOUND_MM_US * pulse_mhz / (4 * self.frequency_mhz) * 1e5
         return min(self.velocity_scale_cm_s, most)
@@ -221,7 +235,9 @@ class Probe(BaseModel):
 
     @property
     def extent_mm(self) -> tuple[float, float, float]:
-        """Width and depth of the image's bounding box, and the part of the depth behind the centre of the face."""
+        """Width and depth of the image's bounding box, and the part of the depth behind the centre of the
+        face.
+        """
         if self.sector is None:
             return self.transducer_width_mm, self.depth_mm, 0.0
         radius, left, right = self.sector
@@ -231,7 +247,8 @@ class Probe(BaseModel):
         return float(2 * half), float(self.depth_mm + above), float(above)
 
     def image_to_probe(self, rows: int, columns: int) -> np.ndarray:
-        """Return the matrix (4, 4) from pixels (column, row, 0), counted from the first one's centre, to the probe's axes [mm].
+        """Return the matrix (4, 4) from pixels (column, row, 0), counted from the first one's centre, to the
+        probe's axes [mm].
 
         The axes are PLUS's: origin at the centre of the array face, x to the marked side, y into the tissue.
         """
@@ -256,7 +273,9 @@ class Probe(BaseModel):
         return radius * (normal - [0.0, 1.0]), direction
 
     def elements(self) -> np.ndarray:
-        """Return the elements on the face (scanlines, 2) [mm]: the starts of the scanlines, or across a phased array."""
+        """Return the elements on the face (scanlines, 2) [mm]: the starts of the scanlines, or across a
+        phased array.
+        """
         if self.transducer_geometry == "CURVILINEAR":
             return self.scanlines()[0]
         share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines - 0.5

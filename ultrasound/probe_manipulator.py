@@ -1,7 +1,8 @@
 """Poses of the transducer, and the probe manipulator that moves it over the organ.
 
-A pose is a rigid (4, 4) matrix, world from transducer [mm]. The transducer is a cuboid about its origin: x lateral
-to the marked side, y elevation, z along its axis; the image leaves its face at z = -length / 2 along -z.
+A pose is a rigid (4, 4) matrix, world from transducer [mm]. The transducer is a cuboid about its origin: x
+lateral to the marked side, y elevation, z along its axis; the image leaves its face at z = -length / 2 along
+-z.
 """
 
 from dataclasses import dataclass, replace
@@ -45,7 +46,9 @@ def array_face_centre(pose: np.ndarray, length_mm: float) -> np.ndarray:
 def pose_at(
     face_centre: np.ndarray, direction: np.ndarray, lateral: np.ndarray, length_mm: float
 ) -> np.ndarray:
-    """Return the pose with its face centred at a point [mm], beam along ``direction``, x nearest to ``lateral``."""
+    """Return the pose with its face centred at a point [mm], beam along ``direction``, x nearest to
+    ``lateral``.
+    """
     z = -np.asarray(direction, float) / np.linalg.norm(direction)
     x = np.asarray(lateral, float) - np.dot(lateral, z) * z
     if np.linalg.norm(x) < 1e-6:
@@ -70,7 +73,9 @@ def image_plane(
 
 
 def pose_of_image_plane(world_from_plane: np.ndarray, length_mm: float) -> np.ndarray:
-    """Return the pose of the transducer with a given image plane (4, 4), whose axes are PLUS's axes of a probe."""
+    """Return the pose of the transducer with a given image plane (4, 4), whose axes are PLUS's axes of a
+    probe.
+    """
     return world_from_plane @ np.linalg.inv(_face(length_mm))
 
 
@@ -82,7 +87,8 @@ def _face(length_mm: float) -> np.ndarray:
 
 
 def indentation(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray, radius_mm: float = 0.0) -> float:
-    """Return the depth [mm] of the array face below the highest point (n, 3) of the settled surface under its footprint.
+    """Return the depth [mm] of the array face below the highest point (n, 3) of the settled surface under its
+    footprint.
 
     Negative above the surface; -inf where the footprint misses it. The face is flat, or an arc of a radius.
     """
@@ -94,7 +100,9 @@ def indentation(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray, radi
 
 
 def _near_footprint(pose: np.ndarray, half_mm: np.ndarray, surface: np.ndarray) -> np.ndarray:
-    """Indices of the points (n, 3) that may be under the footprint, found in float32: of a whole organ these are few."""
+    """Indices of the points (n, 3) that may be under the footprint, found in float32: of a whole organ
+    these are few.
+    """
     axes = pose[:3, :2].T.astype(np.float32)
     x, y = np.abs(axes @ surface.T.astype(np.float32) - (axes @ pose[:3, 3].astype(np.float32))[:, None])
     return np.flatnonzero((x <= half_mm[0] + FOOTPRINT_MARGIN_MM) & (y <= half_mm[1] + FOOTPRINT_MARGIN_MM))
@@ -138,7 +146,8 @@ def moved_towards(pose: np.ndarray, goal: np.ndarray, max_mm: float, max_deg: fl
 
 
 def interpolated(start: np.ndarray, end: np.ndarray, share: float | np.ndarray) -> np.ndarray:
-    """Return the pose (4, 4), or poses (n, 4, 4), at a fraction (0 to 1), or fractions (n,), of the path from start to end.
+    """Return the pose (4, 4), or poses (n, 4, 4), at a fraction (0 to 1), or fractions (n,), of the path from
+    start to end.
 
     Positions are interpolated linearly, rotations spherically.
     """
@@ -149,7 +158,8 @@ def interpolated(start: np.ndarray, end: np.ndarray, share: float | np.ndarray) 
 
 @dataclass(frozen=True)
 class ManipulatorState:
-    """State of the manipulator: depths [mm], turn (3,) [degrees], and the pose aimed at (4, 4), None for home.
+    """State of the manipulator: depths [mm], turn (3,) [degrees], and the pose aimed at (4, 4), None for
+    home.
 
     ``depth_mm`` is set by keys, ``pressed_mm`` is added while a button is held.
     """
@@ -164,8 +174,8 @@ class ManipulatorState:
 class ProbeManipulator:
     """Moves the transducer over the settled organ: aim, turn and depth.
 
-    ``vertices`` (n, 3), ``faces`` (m, 3) and ``normals`` (n, 3) are the settled surface [mm]; ``home`` is the initial pose.
-    ``radius_mm`` is that of a curved face, ``speed_mm_s`` the greatest speed.
+    ``vertices`` (n, 3), ``faces`` (m, 3) and ``normals`` (n, 3) are the settled surface [mm]; ``home`` is the
+    initial pose. ``radius_mm`` is that of a curved face, ``speed_mm_s`` the greatest speed.
     """
 
     vertices: np.ndarray
@@ -203,13 +213,17 @@ class ProbeManipulator:
         )
 
     def point(self, origin: np.ndarray, direction: np.ndarray) -> None:
-        """Aim at the first intersection of a ray [mm] with the settled organ, perpendicular to its surface; ignore a miss."""
+        """Aim at the first intersection of a ray [mm] with the settled organ, perpendicular to its
+        surface; ignore a miss.
+        """
         place = self.ray_hit(origin, direction)
         if place is not None:
             self.aim_at(place)
 
     def aim_at(self, target: np.ndarray, lateral: np.ndarray | None = None) -> None:
-        """Aim at a point of the surface [mm], perpendicular to the patch around it, x nearest to ``lateral``."""
+        """Aim at a point of the surface [mm], perpendicular to the patch around it, x nearest to
+        ``lateral``.
+        """
         lateral = self.lateral if lateral is None else lateral
         aim = pose_at(target, -self.surface_normal(target), lateral, self.size_mm[2])
         self.state = replace(self.state, aim=aim)
@@ -230,7 +244,9 @@ class ProbeManipulator:
         return origin + distance * direction if np.isfinite(distance) else None
 
     def ray_distances(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return the distances (n,), in lengths of the directions, of rays (n, 3) to the settled organ; infinity where they miss."""
+        """Return the distances (n,), in lengths of the directions, of rays (n, 3) to the settled organ;
+        infinity where they miss.
+        """
         hit, distance, _ = self._tree.intersect_ray_first(self.vertices, self.faces, origins, directions)
         return np.where(hit >= 0, distance, np.inf)
 
@@ -258,7 +274,9 @@ class ProbeManipulator:
         self.state = replace(self.state, depth_mm=depth)
 
     def press(self, pressing: bool, time_s: float, share: float = 1.0) -> None:
-        """Press further while the button is held, up to a fraction of the greatest depth; release otherwise."""
+        """Press further while the button is held, up to a fraction of the greatest depth; release
+        otherwise.
+        """
         goal = share * self.max_mm if pressing else 0.0
         before = self.state.pressed_mm
         pressed = np.clip(goal, before - RELEASE_MM_S * time_s, before + PRESS_MM_S * time_s)
@@ -277,7 +295,9 @@ class ProbeManipulator:
         return advanced(touching(pose, self.size_mm, self.samples, self.radius_mm), depth)
 
     def pose_towards(self, goal: np.ndarray, pose: np.ndarray, time_s: float) -> np.ndarray:
-        """Return the pose after a time [s] from a pose towards a goal (4, 4): limited in speed, and not through the organ."""
+        """Return the pose after a time [s] from a pose towards a goal (4, 4): limited in speed, and not
+        through the organ.
+        """
         moved = moved_towards(pose, goal, self.speed_mm_s * time_s, TURN_DEG_S * time_s)
         # The straight path between two points of the surface may cross the organ.
         wanted = max(self.indentation_mm(goal), 0.0)

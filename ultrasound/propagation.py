@@ -1,4 +1,5 @@
-"""Sound in tissue: what each scanline passes through, which interfaces reflect it, and how much of it arrives.
+"""Sound in tissue: what each scanline passes through, which interfaces reflect it, and how much of it
+arrives.
 
 1. ``_sample``: the tissue along each scanline.
 2. ``_find_interfaces``: the steps of impedance, their echoes and what they let pass.
@@ -31,12 +32,13 @@ from ultrasound.sampled_volume import SampledVolume
 
 # Scanline samples between two tissue samples: the larger stride where it is no longer than a voxel.
 STRIDES = (8, 4)
-# Parallel planes that sample the slice thickness: offset in standard deviations of the beam, and weight of energy. Gauss-Hermite
-# quadrature with three nodes, exact for what changes as a polynomial of fifth degree.
+# Parallel planes that sample the slice thickness: offset in standard deviations of the beam, and weight of
+# energy. Gauss-Hermite quadrature with three nodes, exact for what changes as a polynomial of fifth degree.
 CENTRAL_PLANE = ((0.0, 1.0),)
 THICK_PLANE = ((0.0, 2 / 3), (-(1.5**0.5), 1 / 6), (1.5**0.5, 1 / 6))
-# The renal capsule's echo where the beam meets it squarely, the angle [rad] by which it falls to exp(-1/2), and the share of a mirror. An estimate:
-# sonographers expect a thin bright line, which fades where the beam is more than 20 degrees off.
+# The renal capsule's echo where the beam meets it squarely, the angle [rad] by which it falls to exp(-1/2),
+# and the share of a mirror. An estimate: sonographers expect a thin bright line, which fades where the beam
+# is more than 20 degrees off.
 CAPSULE, CAPSULE_TILT, CAPSULE_MIRROR = 0.1, float(np.radians(10)), 0.85
 # Of distances from the organ's surface, between the points at which they are known (``distance_volume``).
 DISTANCE_ERROR_MM = 2.0
@@ -46,7 +48,9 @@ LEAST_FLUID_MRAYL = 0.3
 
 @ti.dataclass
 class TissueSample:
-    """Impedance, attenuation, backscatter and its anisotropy; the rest position [mm]; the map (3, 4) from the image plane to it."""
+    """Impedance, attenuation, backscatter and its anisotropy; the rest position [mm]; the map (3, 4) from
+    the image plane to it.
+    """
 
     tissue: tm.vec4
     rest: tm.vec3
@@ -56,17 +60,19 @@ class TissueSample:
 class Propagation:
     """Sound along the scanlines of a probe, at tissue samples ``stride_of`` scanline samples apart.
 
-    ``tissue_volume`` (.., 4) has impedance, attenuation, backscatter and its anisotropy (``acoustics.properties``), ``organ`` the signed distance
-    from the organ's surface [mm], both at rest. An element transmits and receives only in contact: with the
-    organ, nearer than ``contact_gap_mm``, or, where ``contact`` is "tissue", with anything but gas.
-    ``around`` is the impedance [MRayl] of all that is outside the organ; None for what the CT shows there. With ``has_fluid``, what a
-    scanline passes from the array to the organ, nearer than ``contact_gap_mm`` all the way, is irrigation fluid, but no gas.
+    ``tissue_volume`` (.., 4) has impedance, attenuation, backscatter and its anisotropy
+    (``acoustics.properties``), ``organ`` the signed distance from the organ's surface [mm], both at rest. An
+    element transmits and receives only in contact: with the organ, nearer than ``contact_gap_mm``, or, where
+    ``contact`` is "tissue", with anything but gas. ``around`` is the impedance [MRayl] of all that is outside
+    the organ; None for what the CT shows there. With ``has_fluid``, what a scanline passes from the array to
+    the organ, nearer than ``contact_gap_mm`` all the way, is irrigation fluid, but no gas.
 
-    ``tissue`` and ``rest`` (scanlines, samples) are what is there; ``across`` is the rest direction across the image plane. ``depth`` is
-    where a sample is [mm]; the scanner shows it where it would be if sound were as fast everywhere (SOUND_MM_US).
-    ``amplitude`` of the round trip, and ``path`` [Np/MHz], its attenuation. ``echo`` holds for the sample behind an interface:
-    amplitude reflected as a mirror (with its sign) and diffusely, depth [mm], and the sample where the tissue before it begins; ``capsule`` the
-    same for the renal capsule, a thin layer that no CT shows.
+    ``tissue`` and ``rest`` (scanlines, samples) are what is there; ``across`` is the rest direction across
+    the image plane. ``depth`` is where a sample is [mm]; the scanner shows it where it would be if sound were
+    as fast everywhere (SOUND_MM_US). ``amplitude`` of the round trip, and ``path`` [Np/MHz], its attenuation.
+    ``echo`` holds for the sample behind an interface: amplitude reflected as a mirror (with its sign) and
+    diffusely, depth [mm], and the sample where the tissue before it begins; ``capsule`` the same for the
+    renal capsule, a thin layer that no CT shows.
     """
 
     def __init__(
@@ -98,11 +104,12 @@ class Propagation:
         self.depth, self.passed, self.amplitude, self.path = (zeros(*shape) for _ in range(4))
         # Turned by refraction at a sample [rad].
         self.turn = zeros(*shape)
-        # Half angle of the aperture [rad], SD of the beam across the image plane [mm] and amplitude of harmonics, at each sample.
+        # Half angle of the aperture [rad], SD of the beam across the image plane [mm] and amplitude of
+        # harmonics, at each sample.
         self.aperture_angle, self.slice_sd, self.build_up = (zeros(self.most) for _ in range(3))
         self.speckle_db, self.echo_db = (zeros(PATH_ENTRIES) for _ in range(2))
-        # Half angle of the aperture across the plane [rad]; of interfaces: amplitudes reflected as a mirror and diffusely, slope,
-        # amplitudes scattered evenly by soft and by hard ones.
+        # Half angle of the aperture across the plane [rad]; of interfaces: amplitudes reflected as a mirror
+        # and diffusely, slope, amplitudes scattered evenly by soft and by hard ones.
         self.reflection = zeros(6)
         self.rays = ApertureRays(self.lines, self.most)
 
@@ -111,7 +118,9 @@ class Propagation:
         return STRIDES[0] if STRIDES[0] * probe.sample_mm <= self.voxel_mm else STRIDES[1]
 
     def set_probe(self, probe: Probe, slice_sd_mm: np.ndarray) -> None:
-        """Update the tables of a probe's settings; the SD of the beam across the plane is given at each sample."""
+        """Update the tables of a probe's settings; the SD of the beam across the plane is given at each
+        sample.
+        """
         step_mm = self.stride_of(probe) * probe.sample_mm
         depth = step_mm * np.arange(self.most)
         transmit, receive = half_apertures_mm(probe, np.maximum(depth, 0.5 * step_mm))
@@ -144,7 +153,9 @@ class Propagation:
         )
 
     def run(self, probe: Probe, thick: bool) -> None:
-        """Propagate sound through the plane located last; ``thick`` averages the tissue over the slice thickness."""
+        """Propagate sound through the plane located last; ``thick`` averages the tissue over the slice
+        thickness.
+        """
         stride = self.stride_of(probe)
         count = probe.number_of_samples_per_scanline // stride + 1
         self._find_contact()
@@ -202,7 +213,8 @@ class Propagation:
             if ti.static(self.has_fluid):
                 if in_front:
                     distance = self.organ.sample(found.rest)
-                    # Where a scanline passes the organ at a distance, what is behind is the organ's surroundings, no fluid on it.
+                    # Where a scanline passes the organ at a distance, what is behind is the organ's
+                    # surroundings, no fluid on it.
                     in_front = distance > 0.0 and distance <= self.gap_mm
                     if in_front and found.tissue.x > LEAST_FLUID_MRAYL:
                         found.tissue = tm.vec4(self.fluid)
@@ -233,7 +245,8 @@ class Propagation:
 
     @ti.func
     def anisotropy(self, found, direction):
-        """Return the factor of backscattered amplitude where the beam meets tubules, which run to the capsule, at an angle.
+        """Return the factor of backscattered amplitude where the beam meets tubules, which run to the
+        capsule, at an angle.
 
         Its mean over all directions, in dB, is 0.
         """

@@ -1,7 +1,7 @@
 """The pulse: its spectrum, and how attenuation changes it. NumPy.
 
-Attenuation rises with frequency. So the centre frequency of a pulse falls on its way, it loses less than one of that frequency
-alone, and it becomes longer.
+Attenuation rises with frequency. So the centre frequency of a pulse falls on its way, it loses less than one
+of that frequency alone, and it becomes longer.
 """
 
 from dataclasses import dataclass
@@ -20,11 +20,12 @@ LENGTHS_EVERY = 3
 
 @dataclass(frozen=True)
 class AttenuatedPulse:
-    """How attenuation over the path changes the pulse; each (PATH_ENTRIES,), at multiples of PATH_STEP [Np/MHz].
+    """How attenuation over the path changes the pulse; each (PATH_ENTRIES,), at multiples of PATH_STEP
+    [Np/MHz].
 
-    ``speckle_db`` is the change of the mean square of speckle, ``echo_db`` of the peak of an interface's echo. ``axial_sd_mm`` is
-    the length of that echo, as an SD of the same full width at half maximum; ``speckle_sd_mm`` that of speckle, which correlates by
-    1/2 in intensity where exp(-d^2 / (2 SD^2)) does.
+    ``speckle_db`` is the change of the mean square of speckle, ``echo_db`` of the peak of an interface's
+    echo. ``axial_sd_mm`` is the length of that echo, as an SD of the same full width at half maximum;
+    ``speckle_sd_mm`` that of speckle, which correlates by 1/2 in intensity where exp(-d^2 / (2 SD^2)) does.
     """
 
     speckle_db: np.ndarray
@@ -34,10 +35,11 @@ class AttenuatedPulse:
 
 
 def pulse_spectrum(frequency_mhz: float, bandwidth_percent: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return frequencies [MHz] and amplitudes of the echo of one cycle, transmitted and received by an array of limited bandwidth.
+    """Return frequencies [MHz] and amplitudes of the echo of one cycle, transmitted and received by an array
+    of limited bandwidth.
 
-    The bandwidth is a generalized normal window of -6 dB width, zero at 0 and twice the centre frequency (Garcia 2022, SIMUS,
-    Comput Methods Programs Biomed 218, 106726).
+    The bandwidth is a generalized normal window of -6 dB width, zero at 0 and twice the centre frequency
+    (Garcia 2022, SIMUS, Comput Methods Programs Biomed 218, 106726).
     """
     frequency = np.linspace(0, 2 * frequency_mhz, 1025)[1:-1]
     share = bandwidth_percent / 100
@@ -65,7 +67,9 @@ def attenuated_pulse(frequency_mhz: float, bandwidth_percent: float) -> Attenuat
 
 
 def _lengths_mm(level: float, spectrum: np.ndarray, frequency: np.ndarray) -> np.ndarray:
-    """Return the distance (PATH_ENTRIES,) at which the envelope falls to a level; half of the round trip is the distance."""
+    """Return the distance (PATH_ENTRIES,) at which the envelope falls to a level; half of the round trip
+    is the distance.
+    """
     entries = np.arange(0, PATH_ENTRIES, LENGTHS_EVERY)
     at_entries = [_time_to(level, spectrum[each], frequency) * SOUND_MM_US / 2 for each in entries]
     return np.interp(np.arange(PATH_ENTRIES), entries, at_entries)

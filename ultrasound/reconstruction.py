@@ -1,8 +1,9 @@
-"""Volume reconstruction from tracked images: freehand 3D ultrasound, a pixel-based method of Solberg et al. 2007.
+"""Volume reconstruction from tracked images: freehand 3D ultrasound, a pixel-based method of Solberg et al.
+2007.
 
 1. Distribution: each pixel is added to the nearest voxel, or to the eight around it.
-2. Hole filling within the closing of the scanned region by a ball, which does not extend the region. Holes take the nearest
-   voxel with data, or an interpolation between the images on both sides.
+2. Hole filling within the closing of the scanned region by a ball, which does not extend the region. Holes
+   take the nearest voxel with data, or an interpolation between the images on both sides.
 
 O. V. Solberg, F. Lindseth, H. Torp, R. E. Blake, T. A. Nagelhus Hernes, Freehand 3D ultrasound reconstruction
 algorithms - a review, Ultrasound in Medicine & Biology 33(7), 2007, doi 10.1016/j.ultrasmedbio.2007.02.015.
@@ -25,8 +26,8 @@ SMOOTHING_VOXELS = 1.0
 class VoxelBox:
     """Cubic voxels along the axes of the reference frame.
 
-    ``origin_mm`` (3,) is the centre of the first voxel, ``spacing_mm`` the distance to the next, ``shape`` the counts
-    along x, y and z. Raises ValueError for no voxels, or more than MAX_VOXELS.
+    ``origin_mm`` (3,) is the centre of the first voxel, ``spacing_mm`` the distance to the next, ``shape``
+    the counts along x, y and z. Raises ValueError for no voxels, or more than MAX_VOXELS.
     """
 
     origin_mm: np.ndarray
@@ -38,7 +39,8 @@ class VoxelBox:
             raise ValueError(f"a box needs a voxel along each axis, not {self.shape}")
         if math.prod(self.shape) > MAX_VOXELS:
             raise ValueError(
-                f"{' x '.join(f'{n:g}' for n in self.shape)} voxels of {self.spacing_mm:g} mm are over {MAX_VOXELS:,}: "
+                f"{' x '.join(f'{n:g}' for n in self.shape)} voxels of {self.spacing_mm:g} mm are over "
+                f"{MAX_VOXELS:,}: "
                 "take larger voxels or a smaller region"
             )
 
@@ -65,11 +67,11 @@ class VoxelBox:
 class Reconstruction:
     """Images accumulated in a box of voxels. The same images in the same order give the same bits.
 
-    - "nearest": pixel nearest neighbour (Solberg et al. 2007). A voxel is the mean of its pixels; a hole takes the nearest
-      voxel with data.
-    - "smooth": a pixel is distributed to the eight voxels around it by trilinear weights (PLUS's LINEAR). Holes are
-      interpolated along sticks (``_along_sticks``) and smoothed by normalised convolution (Knutsson & Westin 1993,
-      doi 10.1109/CVPR.1993.341081). Voxels with data are not changed.
+    - "nearest": pixel nearest neighbour (Solberg et al. 2007). A voxel is the mean of its pixels; a hole
+      takes the nearest voxel with data.
+    - "smooth": a pixel is distributed to the eight voxels around it by trilinear weights (PLUS's LINEAR).
+      Holes are interpolated along sticks (``_along_sticks``) and smoothed by normalised convolution (Knutsson
+      & Westin 1993, doi 10.1109/CVPR.1993.341081). Voxels with data are not changed.
     """
 
     def __init__(self, box: VoxelBox, method: str) -> None:
@@ -84,8 +86,8 @@ class Reconstruction:
     ) -> None:
         """Add an image (rows, columns) of any numbers, where ``mask`` (rows, columns) is true.
 
-        ``reference_from_image`` (4, 4) maps (column, row, 0, 1), counted from the first pixel's centre, to the reference
-        frame [mm]; pixels outside the box are ignored.
+        ``reference_from_image`` (4, 4) maps (column, row, 0, 1), counted from the first pixel's centre, to
+        the reference frame [mm]; pixels outside the box are ignored.
         """
         matrix = self.box.index_from_mm @ reference_from_image
         along_row, along_column, first = (matrix[:3, k, None, None] for k in (0, 1, 3))
@@ -128,8 +130,8 @@ class Reconstruction:
     def volume(self, reach_mm: float) -> tuple[np.ndarray, np.ndarray]:
         """Return values (x, y, z) float32 and the mask (x, y, z) of voxels with data or in a hole.
 
-        The mask is the closing, by a ball of ``reach_mm``, of the voxels with data: holes up to twice as wide are filled.
-        Elsewhere values are 0.
+        The mask is the closing, by a ball of ``reach_mm``, of the voxels with data: holes up to twice as wide
+        are filled. Elsewhere values are 0.
         """
         values, known = np.zeros(self.box.shape, np.float32), np.zeros(self.box.shape, bool)
         if self._seen.any():
@@ -145,7 +147,9 @@ class Reconstruction:
 
 
 def _filled(values: np.ndarray, seen: np.ndarray, reach: float, method: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return values (x, y, z) with holes filled, and the closing of ``seen`` (x, y, z) by ``reach`` voxels."""
+    """Return values (x, y, z) with holes filled, and the closing of ``seen`` (x, y, z) by ``reach``
+    voxels.
+    """
     # Padding: without it the closing would include the border.
     margin = int(reach) + 2
     inner = (slice(margin, -margin),) * 3
@@ -183,11 +187,13 @@ def _gaussian(values: np.ndarray) -> np.ndarray:
 def _along_sticks(
     values: np.ndarray, seen: np.ndarray, gap: np.ndarray, near: np.ndarray, longest: int
 ) -> np.ndarray:
-    """Return values (m,) at voxels ``gap`` (3, m): between the nearest voxel with data, ``near`` (3, m), and the first beyond.
+    """Return values (m,) at voxels ``gap`` (3, m): between the nearest voxel with data, ``near`` (3, m), and
+    the first beyond.
 
     Weighted by distance, as in Vaughan, Lasso, Ungi, Fichtinger, Hole filling with oriented sticks in
     ultrasound volume reconstruction, J Med Imaging 2(3), 2015, doi 10.1117/1.JMI.2.3.034002; the stick points
-    to the nearest voxel with data instead of the best of 13 directions. With none within ``longest``: the nearest's value.
+    to the nearest voxel with data instead of the best of 13 directions. With none within ``longest``: the
+    nearest's value.
     """
     distance = np.linalg.norm(gap - near, axis=0)
     direction = (gap - near) / distance

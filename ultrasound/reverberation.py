@@ -1,9 +1,10 @@
 """Reverberation: echoes that arrive later because sound went to and fro.
 
-Behind gas, the tissue in front of it is seen again, weaker, as sound returns from it by way of the gas (dirty shadow); bubbles ring on
-for a long time (ring-down). A clip of metal sends sound to and fro within itself (comet tail). The face of the array reflects what
-returns to it, so that strong interfaces are repeated; and its own vibration takes a while to die down (near field).
-The strengths are estimates, after images of atlases; the vibration in air is that of a recorded array.
+Behind gas, the tissue in front of it is seen again, weaker, as sound returns from it by way of the gas (dirty
+shadow); bubbles ring on for a long time (ring-down). A clip of metal sends sound to and fro within itself
+(comet tail). The face of the array reflects what returns to it, so that strong interfaces are repeated; and
+its own vibration takes a while to die down (near field). The strengths are estimates, after images of
+atlases; the vibration in air is that of a recorded array.
 """
 
 import numpy as np
@@ -18,21 +19,23 @@ from ultrasound.pulse import DB_OF_NEPER
 
 # Tissue of less impedance is gas, of more it is metal [MRayl].
 GAS_MRAYL, METAL_MRAYL = 0.3, 15.0
-# Amplitude that the face of the array reflects. An interface that returns less than the second amplitude is not repeated visibly.
+# Amplitude that the face of the array reflects. An interface that returns less than the second amplitude is
+# not repeated visibly.
 FACE, LEAST_REPEATED = 0.25, 0.01
 # Amplitude of tissue that is seen by way of gas.
 BY_GAS = 0.35
 # Bubbles: share of the surface of gas, distance, amplitude and fall.
 BUBBLE_SHARE, BUBBLE_MM, BUBBLE_AMPLITUDE, BUBBLE_FALL_DB_MM = 0.08, 1.5, 0.06, 0.5
-# Bubbles ring where the beam meets the gas nearly squarely: where a third of it is returned as by a mirror, or more.
+# Bubbles ring where the beam meets the gas nearly squarely: where a third of it is returned as by a mirror,
+# or more.
 BUBBLE_SQUARELY = 3.0
 # A clip is taken to be at least so thick [mm]; it may be thinner than the distance of tissue samples.
 LEAST_METAL_MM = 0.8
-# Vibration of the array in contact, and in air: the length in wavelengths over which it falls to 1 / e; and how much stronger it is in
-# air [dB]: estimates, as no recording has both.
+# Vibration of the array in contact, and in air: the length in wavelengths over which it falls to 1 / e; and
+# how much stronger it is in air [dB]: estimates, as no recording has both.
 FALL, MORE_IN_AIR_DB = 1.5, 6.0
-# In air, fitted to a linear array in air (PLUS's UltrasonixLinearRfData; study scanner): that length, the thickness of the lens between
-# whose faces it bands, in wavelengths, and half of the depth of these bands.
+# In air, fitted to a linear array in air (PLUS's UltrasonixLinearRfData; study scanner): that length, the
+# thickness of the lens between whose faces it bands, in wavelengths, and half of the depth of these bands.
 FALL_IN_AIR, LENS, BANDS = 9.4, 5.3, 0.27
 
 
@@ -70,7 +73,9 @@ class Reverberation:
 
     @ti.func
     def add_behind_gas(self, line, gas, front, count, step_mm):
-        """Add what is seen by way of gas: the tissue in front, from the surface of the gas back to the face, then forth again."""
+        """Add what is seen by way of gas: the tissue in front, from the surface of the gas back to the
+        face, then forth again.
+        """
         arrived, path = self.sound.amplitude[line, front], self.sound.path[line, front]
         squarely = ti.min(BUBBLE_SQUARELY * ti.abs(self.sound.echo[line, gas].x), 1.0)
         bubble = BUBBLE_AMPLITUDE * arrived * squarely * self.has_bubble(self.sound.rest[line, front])
@@ -125,7 +130,9 @@ class Reverberation:
 
 
 def ringing(probe: Probe) -> np.ndarray:
-    """Return the amplitude of the array's own vibration at each sample, in air and in contact, (2, samples) float32."""
+    """Return the amplitude of the array's own vibration at each sample, in air and in contact, (2,
+    samples) float32.
+    """
     depth = (np.arange(probe.number_of_samples_per_scanline) + 0.5) * probe.sample_mm / probe.wavelength_mm
     start = 10 ** (probe.ringing_db / 20)
     bands = 1 - BANDS + BANDS * np.cos(2 * np.pi * depth / LENS)

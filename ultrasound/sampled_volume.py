@@ -18,8 +18,8 @@ FAR_MM = 1e6
 class SampledVolume:
     """Voxels (nx, ny, nz) float32 with the affine map (4, 4) that takes mm to voxel indices.
 
-    Index (0, 0, 0) is the centre of the first voxel. ``outside`` is the value beyond the outer half voxel. With a last
-    axis (nx, ny, nz, c) every voxel holds a vector of c values, which are sampled together.
+    Index (0, 0, 0) is the centre of the first voxel. ``outside`` is the value beyond the outer half voxel.
+    With a last axis (nx, ny, nz, c) every voxel holds a vector of c values, which are sampled together.
     """
 
     def __init__(self, voxels: np.ndarray, index_from_mm: np.ndarray, outside: float = AIR_HU) -> None:
@@ -56,7 +56,9 @@ class SampledVolume:
 
     @ti.func
     def cell_at(self, p):
-        """Return the first of the eight voxels around p [mm], the offsets to the next ones (0 to 1), and whether p is inside."""
+        """Return the first of the eight voxels around p [mm], the offsets to the next ones (0 to 1), and
+        whether p is inside.
+        """
         at = self.linear @ p + self.offset
         last = tm.vec3(self.shape[0] - 1, self.shape[1] - 1, self.shape[2] - 1)
         inside = (at >= -0.5).all() and (at <= last + 0.5).all()
@@ -99,7 +101,9 @@ class SampledVolume:
 
     @ti.func
     def lanes_along(self, axis: ti.template(), at):
-        """Along one axis: the voxels before the points [voxels], the offsets to the next, the distances outside."""
+        """Along one axis: the voxels before the points [voxels], the offsets to the next, the distances
+        outside.
+        """
         clamped = ti.min(ti.max(at, 0.0), float(self.shape[axis] - 1))
         base = ti.min(ti.cast(clamped, ti.i32), self.count[axis] - 2)
         return base, clamped - base, ti.abs(at - clamped)
@@ -132,10 +136,11 @@ class SampledVolume:
 
     @ti.func
     def gradient(self, p):
-        """Return the gradient [1/mm] of the first trilinear value at p [mm], over a voxel to each side; zero outside.
+        """Return the gradient [1/mm] of the first trilinear value at p [mm], over a voxel to each side; zero
+        outside.
 
-        The derivative of the trilinear value itself is constant along its axis in each cell: of a thin interface it gives a wrong
-        direction.
+        The derivative of the trilinear value itself is constant along its axis in each cell: of a thin
+        interface it gives a wrong direction.
         """
         at = self.linear @ p + self.offset
         last = tm.vec3(self.shape[0] - 1, self.shape[1] - 1, self.shape[2] - 1)
@@ -151,7 +156,9 @@ class SampledVolume:
 
     @ti.func
     def slope(self, p):
-        """Return the gradient [1/mm] of the trilinear value at p [mm] of a volume of scalars, within its cell; zero outside."""
+        """Return the gradient [1/mm] of the trilinear value at p [mm] of a volume of scalars, within its
+        cell; zero outside.
+        """
         first, t, inside = self.cell_at(p)
         along = tm.vec3(0.0)
         if inside:
@@ -186,7 +193,9 @@ class SampledVolume:
 def distance_volume(
     surface: trimesh.Trimesh, spacing_mm: float = 2.0, reach_mm: float = 6.0
 ) -> SampledVolume:
-    """Return signed distances [mm] to a closed surface, negative inside, up to ``reach_mm`` around it; FAR_MM beyond."""
+    """Return signed distances [mm] to a closed surface, negative inside, up to ``reach_mm`` around it;
+    FAR_MM beyond.
+    """
     distance, low = distance_grid(surface.vertices, surface.faces, spacing_mm, reach_mm)
     index_from_mm = np.eye(4)
     index_from_mm[:3] /= spacing_mm

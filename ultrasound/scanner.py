@@ -185,7 +185,8 @@ class Scanner:
 
 
 def plane_section(vertices: np.ndarray, faces: np.ndarray, plane_from_world: np.ndarray) -> np.ndarray:
-    """Return the section of a closed surface (v, 3), (f, 3) [mm] with the plane w = 0: segments (n, 2, 2) of (u, v) [mm].
+    """Return the section of a closed surface (v, 3), (f, 3) [mm] with the plane w = 0: segments (n, 2, 2) of
+    (u, v) [mm].
 
     ``plane_from_world`` (4, 4) is rigid: u to the marked side, v down into the tissue, w out of the plane.
     """

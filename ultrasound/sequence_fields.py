@@ -1,4 +1,6 @@
-"""Fields of a sequence file, of the whole and of each frame: what the two formats of a sweep have in common."""
+"""Fields of a sequence file, of the whole and of each frame: what the two formats of a sweep have in
+common.
+"""
 
 import re
 import reprlib
@@ -13,7 +15,10 @@ FrameFields = dict[int, dict[str, str]]
 
 
 def put_field(name: str, text: str, fields: dict[str, str], frames: FrameFields) -> None:
-    """Put a field among those of the header, or of its frame by number. Raises SweepError: twice, or a frame's without number."""
+    """Put a field among those of the header, or of its frame by number.
+
+    Raises SweepError: twice, or a frame's without number.
+    """
     match = FRAME_FIELD.fullmatch(name)
     if name.startswith("Seq_Frame") and not match:
         raise SweepError(f"field {reprlib.repr(name)}: expected Seq_Frame0000_Name")
@@ -24,7 +29,10 @@ def put_field(name: str, text: str, fields: dict[str, str], frames: FrameFields)
 
 
 def numbers_of(name: str, text: str, expected: str) -> tuple[int, ...]:
-    """The columns, rows and frames, or more numbers, in a text. Raises SweepError: other than ``expected``, or too many pixels."""
+    """The columns, rows and frames, or more numbers, in a text.
+
+    Raises SweepError: other than ``expected``, or too many pixels.
+    """
     words = text.split()
     if len(words) != len(expected.split()) or not all(re.fullmatch("[0-9]{1,9}", word) for word in words):
         raise SweepError(f"{name} = {reprlib.repr(text)}: expected {expected}")
@@ -59,7 +67,8 @@ def field_line(name: str, separator: str, text: str) -> bytes:
     marks = separator.strip() + "#" * (":" in separator)
     if set(name) & set(marks) or name != name.strip() or not name or "\n" in name + text:
         raise SweepError(
-            f"field {reprlib.repr(name + ' = ' + text)}: expected one line, no {' or '.join(marks)} in the name"
+            f"field {reprlib.repr(name + ' = ' + text)}: expected one line, no {' or '.join(marks)} in the "
+            "name"
         )
     try:
         return f"{name}{separator}{text}\n".encode("latin-1")

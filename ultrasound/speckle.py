@@ -1,12 +1,14 @@
 """Speckle: scatterers as complex noise of the rest position, so that it moves and deforms with the tissue.
 
-Many scatterers per resolution cell, much smaller than the wavelength, give circular complex Gaussian echoes (Goodman 1975), whose
-correlation is that of the pulse and of the beam (Wagner 1983). So the noise has the pulse's length built in along the image plane,
-and the beam's correlation length across it. The phase of the carrier, which does not affect the magnitude, is left out.
+Many scatterers per resolution cell, much smaller than the wavelength, give circular complex Gaussian echoes
+(Goodman 1975), whose correlation is that of the pulse and of the beam (Wagner 1983). So the noise has the
+pulse's length built in along the image plane, and the beam's correlation length across it. The phase of the
+carrier, which does not affect the magnitude, is left out.
 
-Across the plane the noise is longer than along it. Its long axis has one of many fixed directions, two of which are mixed where the
-plane turns from one to the next; and one of the fixed lengths ELEVATION_SD_MM.
-So speckle depends on nothing but the tissue's rest position and on where the plane lies: a sweep that comes back shows it again.
+Across the plane the noise is longer than along it. Its long axis has one of many fixed directions, two of
+which are mixed where the plane turns from one to the next; and one of the fixed lengths ELEVATION_SD_MM.
+So speckle depends on nothing but the tissue's rest position and on where the plane lies: a sweep that comes
+back shows it again.
 """
 
 import numpy as np
@@ -22,15 +24,16 @@ PITCHES = 1.25
 # Correlation of neighbouring entries.
 NEXT = float(np.exp(-1 / (4 * PITCHES**2)))
 SEED = 20130629
-# Many points are exactly on the planes through 0, where rounding would choose the cell: cells begin elsewhere.
+# Many points are exactly on the planes through 0, where rounding would choose the cell: cells begin
+# elsewhere.
 CELL_OFFSET = 0.37
 # Real and imaginary part share one 32-bit word, so that the block fits into the cache.
 UNIT = 1 / 4096
 # Lengths across the image plane, in steps of a quarter of an octave.
 SHORTEST_SD_MM, LENGTH_STEP, LEVELS = 0.05, 2.0**0.25, 29
 ELEVATION_SD_MM = SHORTEST_SD_MM * LENGTH_STEP ** np.arange(LEVELS)
-# Directions of the long axis: so many each way on a face of a cube. Two directions, or two lengths, are mixed in this part of the way
-# between them: elsewhere there is one noise to compute.
+# Directions of the long axis: so many each way on a face of a cube. Two directions, or two lengths, are mixed
+# in this part of the way between them: elsewhere there is one noise to compute.
 DIRECTIONS, MIXED = 23, 0.2
 QUARTER = float(np.pi / 4)
 # Two directions each way on the cube's face, two lengths.
@@ -38,9 +41,11 @@ COMPONENTS, LEAST_WEIGHT = 8, 1e-3
 
 
 def noise_block() -> np.ndarray:
-    """Return periodic complex Gaussian noise (SIZE, SIZE, SIZE, 2) float32 of unit mean square, the same on every machine.
+    """Return periodic complex Gaussian noise (SIZE, SIZE, SIZE, 2) float32 of unit mean square, the same on
+    every machine.
 
-    White noise convolved with a Gaussian of PITCHES entries SD: entries at a distance d correlate by exp(-d^2 / (4 PITCHES^2)).
+    White noise convolved with a Gaussian of PITCHES entries SD: entries at a distance d correlate by exp(-d^2
+    / (4 PITCHES^2)).
     """
     white = np.random.default_rng(SEED).standard_normal((2, SIZE, SIZE, SIZE))
     frequency = 2 * np.pi * np.fft.fftfreq(SIZE)
@@ -52,7 +57,8 @@ def noise_block() -> np.ndarray:
 
 
 def elevation_levels(sd_mm: np.ndarray) -> np.ndarray:
-    """Return, for correlation SDs (n,) [mm], index of the shorter length, its weight, that of the next one, and the shorter length.
+    """Return, for correlation SDs (n,) [mm], index of the shorter length, its weight, that of the next one,
+    and the shorter length.
 
     (n, 4) float32. The length is that of the nearest index, up to 9 % off.
     """
@@ -65,7 +71,9 @@ def elevation_levels(sd_mm: np.ndarray) -> np.ndarray:
 
 @ti.dataclass
 class LongAxis:
-    """Directions of the long axis to mix: face of the cube (0 to 2), indices on it, steps (-1 or 1) to the next, and their shares."""
+    """Directions of the long axis to mix: face of the cube (0 to 2), indices on it, steps (-1 or 1) to the
+    next, and their shares.
+    """
 
     face: ti.i32
     index: ti.math.ivec2
@@ -74,7 +82,8 @@ class LongAxis:
 
 
 class Speckle:
-    """The noise block on the device. Each block of space holds it, shifted by a hash of the block, so that it does not repeat.
+    """The noise block on the device. Each block of space holds it, shifted by a hash of the block, so that it
+    does not repeat.
 
     Speckle of unit mean square is the sum of COMPONENTS noises, each with its ``weight``; most have none.
     """
@@ -92,7 +101,9 @@ class Speckle:
 
     @ti.func
     def at(self, place, key):
-        """Return the noise (2,), of unit mean square, at a place in entries: interpolated along its last axis, the long one."""
+        """Return the noise (2,), of unit mean square, at a place in entries: interpolated along its last
+        axis, the long one.
+        """
         at = place + CELL_OFFSET
         cell = ti.floor(at, ti.i32)
         t = at.z - cell.z
@@ -130,9 +141,11 @@ class Speckle:
 
     @ti.func
     def component(self, each, axis, lengths, sd_mm, look):
-        """Return key and matrix (3, 3) from the rest position [mm] to entries of one of the COMPONENTS noises.
+        """Return key and matrix (3, 3) from the rest position [mm] to entries of one of the COMPONENTS
+        noises.
 
-        ``sd_mm`` is the length along the image plane. Another ``look``, of an image steered by another angle, has other noise.
+        ``sd_mm`` is the length along the image plane. Another ``look``, of an image steered by another angle,
+        has other noise.
         """
         other, longer = ti.Vector([(each >> 2) & 1, (each >> 1) & 1]), each & 1
         index = axis.index + other * axis.step

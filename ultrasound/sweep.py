@@ -1,7 +1,7 @@
 """A tracked ultrasound sweep: images and tracked transforms, as in an IGSIO sequence metafile.
 
-The transform ``ImageToProbe`` maps a point (x, y, z, 1) of Image to Probe. Image is in pixels (column, row, 0) of orientation MF,
-every other coordinate system in mm.
+The transform ``ImageToProbe`` maps a point (x, y, z, 1) of Image to Probe. Image is in pixels (column, row,
+0) of orientation MF, every other coordinate system in mm.
 """
 
 import re
@@ -22,8 +22,8 @@ from errors import UserError
 TRANSFORM_NAME = re.compile(r"(\w+?)To((?![a-z])\w+)")
 TRANSFORM_FIELD = re.compile(r"(\w+?To(?![a-z])\w+)Transform")
 CONFIGURATION_LIMIT = 1 << 22
-# Directions of increasing column and row: (un)marked side, far or near. U with F, and M with N, make a left-handed image, whose
-# third axis is descending in IGSIO; a third letter has no effect on a single slice.
+# Directions of increasing column and row: (un)marked side, far or near. U with F, and M with N, make a
+# left-handed image, whose third axis is descending in IGSIO; a third letter has no effect on a single slice.
 ORIENTATIONS = {each: each for each in ("MF", "MN", "UF", "UN", "FM", "NM", "FU", "NU")}
 ORIENTATIONS |= {f"{each}A": each for each in ORIENTATIONS} | {"UFD": "UF", "MND": "MN"}
 
@@ -45,9 +45,10 @@ class SweepError(UserError):
 class Sweep:
     """Images and transforms of one sweep.
 
-    ``images`` is uint8 (n, rows, columns) in orientation MF: columns increase to the marked side, rows away from the face;
-    (n, 0, 0) for a sweep of poses only. It may be read-only. ``frames`` are the fields of each frame and ``fields`` those of the
-    header, as text, in the file's order. ``constant`` are transforms (4, 4) of all frames, by name (see ``load_constants``).
+    ``images`` is uint8 (n, rows, columns) in orientation MF: columns increase to the marked side, rows away
+    from the face; (n, 0, 0) for a sweep of poses only. It may be read-only. ``frames`` are the fields of each
+    frame and ``fields`` those of the header, as text, in the file's order. ``constant`` are transforms (4, 4)
+    of all frames, by name (see ``load_constants``).
 
     Raises SweepError where images and frames differ in number.
     """
@@ -60,7 +61,8 @@ class Sweep:
     def __post_init__(self) -> None:
         if self.images.dtype != np.uint8 or self.images.ndim != 3 or len(self.images) != len(self.frames):
             raise SweepError(
-                f"images of {self.images.dtype} {self.images.shape}: expected uint8 ({len(self.frames)}, rows, columns)"
+                f"images of {self.images.dtype} {self.images.shape}: expected uint8 ({len(self.frames)}, "
+                "rows, columns)"
             )
 
     def __len__(self) -> int:
@@ -81,10 +83,11 @@ class Sweep:
         return times
 
     def transform(self, start: str, end: str, frame: int) -> np.ndarray | None:
-        """Return the matrix (4, 4) from ``start`` to ``end``, such as "Image" and "Reference", along the shortest chain of transforms.
+        """Return the matrix (4, 4) from ``start`` to ``end``, such as "Image" and "Reference", along the
+        shortest chain of transforms.
 
-        None where a transform of the chain was not tracked (status not OK). Raises SweepError where no chain joins the two, or
-        where one of its transforms is not an affine matrix.
+        None where a transform of the chain was not tracked (status not OK). Raises SweepError where no chain
+        joins the two, or where one of its transforms is not an affine matrix.
         """
         fields = self.frames[frame]
         tracked = [match[1] for key in fields if (match := TRANSFORM_FIELD.fullmatch(key))]
@@ -117,7 +120,9 @@ class Sweep:
 
 
 def shortest_chain(names: Iterable[str], start: str, end: str) -> list[tuple[str, bool]] | None:
-    """Return the transforms from ``start`` to ``end``, each with whether to invert it; None where no chain joins them."""
+    """Return the transforms from ``start`` to ``end``, each with whether to invert it; None where no chain
+    joins them.
+    """
     steps: dict[str, list[tuple[str, str, bool]]] = {}
     for name in names:
         if match := TRANSFORM_NAME.fullmatch(name):
@@ -144,7 +149,8 @@ def reoriented(images: np.ndarray, orientation: str) -> np.ndarray:
 
 
 def load_constants(path: Path) -> dict[str, np.ndarray]:
-    """Return the transforms (4, 4) of a PLUS configuration's CoordinateDefinitions, by name: {"ImageToProbe": ...}.
+    """Return the transforms (4, 4) of a PLUS configuration's CoordinateDefinitions, by name: {"ImageToProbe":
+    ...}.
 
     Raises SweepError for a file that cannot be read, has no transform, or an invalid one.
     """
@@ -168,27 +174,34 @@ def load_constants(path: Path) -> dict[str, np.ndarray]:
         if not isinstance(error, (OSError, SweepError)):
             found = f"no XML: {found}"
         raise SweepError(
-            f"{path.name}: {found}; expected a PLUS configuration (XML); a scene or a patient's folder goes after --scene"
+            f"{path.name}: {found}; expected a PLUS configuration (XML); a scene or a patient's folder goes "
+            "after --scene"
         ) from error
     return constants
 
 
 def transform_fields(name: str, matrix: np.ndarray | None) -> dict[str, str]:
-    """Return the fields of a frame for a transform, such as "ProbeToReference"; None is one that was not tracked."""
+    """Return the fields of a frame for a transform, such as "ProbeToReference"; None is one that was not
+    tracked.
+    """
     status = "INVALID" if matrix is None else "OK"
     text = transform_text(np.eye(4) if matrix is None else matrix)
     return {f"{name}Transform": text, f"{name}TransformStatus": status}
 
 
 def transform_text(matrix: np.ndarray) -> str:
-    """Return sixteen numbers row by row that read back to the same float64; SweepError for what is not an affine matrix (4, 4)."""
+    """Return sixteen numbers row by row that read back to the same float64; SweepError for what is not an
+    affine matrix (4, 4).
+    """
     affine = _affine(np.asarray(matrix, float), "a transform", reprlib.repr(np.asarray(matrix).tolist()))
     # Adding 0 removes the sign of a negative zero.
     return " ".join(repr(float(number) + 0.0).removesuffix(".0") for number in affine.flat)
 
 
 def matrix_of(text: str, what: str) -> np.ndarray:
-    """Return the affine matrix (4, 4) of sixteen numbers row by row; else raise SweepError, which names ``what``."""
+    """Return the affine matrix (4, 4) of sixteen numbers row by row; else raise SweepError, which names
+    ``what``.
+    """
     try:
         numbers = np.array(text.split(), float)
     except ValueError:

@@ -1,4 +1,6 @@
-"""Sweeps as sequence files of PLUS: metafiles (.igs.mha), also of 3D Slicer, a MetaImage whose header has poses and times; and NRRD."""
+"""Sweeps as sequence files of PLUS: metafiles (.igs.mha), also of 3D Slicer, a MetaImage whose header has
+poses and times; and NRRD.
+"""
 
 import os
 import reprlib
@@ -77,9 +79,11 @@ PROBE_FIELD, VERSION_FIELD = "TransducerName", "NephronVersion"
 
 
 def read_sweep(path: Path) -> Sweep:
-    """Return a sequence file's images, in MF, and fields, with the names of a metafile. Times and transforms are parsed on demand.
+    """Return a sequence file's images, in MF, and fields, with the names of a metafile. Times and transforms
+    are parsed on demand.
 
-    Raises SweepError with the file's name for a file that cannot be read, is damaged, or is not an 8-bit B-mode sweep.
+    Raises SweepError with the file's name for a file that cannot be read, is damaged, or is not an 8-bit
+    B-mode sweep.
     """
     try:
         with path.open("rb") as file:
@@ -89,10 +93,11 @@ def read_sweep(path: Path) -> Sweep:
 
 
 def write_sweep(path: Path, sweep: Sweep) -> None:
-    """Write a sweep, as NRRD where the name ends in .nrrd, else as a metafile; a sweep that was read from one keeps the lines of its
-    header. The same sweep gives the same bytes.
+    """Write a sweep, as NRRD where the name ends in .nrrd, else as a metafile; a sweep that was read from one
+    keeps the lines of its header. The same sweep gives the same bytes.
 
-    Raises SweepError for a sweep that does not fit into a file, and OSError; an existing file is then not changed.
+    Raises SweepError for a sweep that does not fit into a file, and OSError; an existing file is then not
+    changed.
     """
     with SweepWriter(path, sweep.fields) as writer:
         for image, fields in zip(sweep.images, sweep.frames, strict=True):
@@ -112,10 +117,12 @@ def suffix_of(sweep: Path) -> str:
 
 
 class SweepWriter:
-    """Writes a sweep frame by frame, pixels to disk; ``close`` writes the file atomically. ``count`` is the number of frames so far.
+    """Writes a sweep frame by frame, pixels to disk; ``close`` writes the file atomically. ``count`` is the
+    number of frames so far.
 
-    The format is that of the name: NRRD (.nrrd), else a metafile. ``fields`` add to PLUS's own, or replace them where they are those
-    of a sweep that was read. As a context manager it closes at the end, and leaves no file after an exception.
+    The format is that of the name: NRRD (.nrrd), else a metafile. ``fields`` add to PLUS's own, or replace
+    them where they are those of a sweep that was read. As a context manager it closes at the end, and leaves
+    no file after an exception.
     """
 
     def __init__(self, path: Path, fields: dict[str, str]) -> None:
@@ -139,7 +146,8 @@ class SweepWriter:
     def append(self, image: np.ndarray, fields: dict[str, str]) -> None:
         """Add a frame: uint8 (rows, columns) in MF, (0, 0) in a sweep of poses alone, and its fields as text.
 
-        Raises SweepError for an image or text that does not fit into the file, which then continues without this frame.
+        Raises SweepError for an image or text that does not fit into the file, which then continues without
+        this frame.
         """
         if image.dtype != np.uint8 or image.ndim != 2 or image.shape != (self._shape or image.shape):
             found, expected = f"{image.dtype} {image.shape}", self._shape or "(rows, columns)"
@@ -207,7 +215,10 @@ class SweepWriter:
 
 
 class LabelledSweep:
-    """Writes STEM.igs.mha and STEM-marks.igs.mha into a folder, both or none. Reference is the patient (LPS, mm). Raises OSError."""
+    """Writes STEM.igs.mha and STEM-marks.igs.mha into a folder, both or none.
+
+    Reference is the patient (LPS, mm). Raises OSError.
+    """
 
     def __init__(self, folder: Path, stem: str, probe: Probe) -> None:
         self.name = f"{stem}{SUFFIX}"
@@ -229,7 +240,10 @@ class LabelledSweep:
         reference_from_probe: np.ndarray,
         time_s: float,
     ) -> None:
-        """Add a frame: grey values and ``PixelLabel`` values (rows, columns), probe pose (4, 4), time. Raises OSError, SweepError."""
+        """Add a frame: grey values and ``PixelLabel`` values (rows, columns), probe pose (4, 4), time.
+
+        Raises OSError, SweepError.
+        """
         pose = transform_fields("ProbeToReference", reference_from_probe)
         pose |= transform_fields("ImageToProbe", probe.image_to_probe(*image.shape))
         fields = pose | {"Timestamp": repr(float(time_s)), "ImageStatus": "OK"}
@@ -275,7 +289,8 @@ def _read_header(file: BinaryIO) -> tuple[dict[str, str], FrameFields]:
     frames: FrameFields = {}
     if b"".join(file.readline(HEADER_LIMIT).split()) != b"ObjectType=Image":
         raise SweepError(
-            "is not a sweep; expected a tracked one (.igs.mha, .igs.nrrd), which begins with ObjectType = Image or NRRD"
+            "is not a sweep; expected a tracked one (.igs.mha, .igs.nrrd), which begins with ObjectType = "
+            "Image or NRRD"
         )
     file.seek(0)
     while True:

@@ -1,4 +1,6 @@
-"""What of a patient there may be to see: the tumour with a margin around it, the tumour alone, the whole organ."""
+"""What of a patient there may be to see: the tumour with a margin around it, the tumour alone, the whole
+organ.
+"""
 
 from typing import Literal, get_args
 

@@ -27,11 +27,12 @@ class TrackingErrors:
 def with_tracking_errors(
     poses: np.ndarray, times_s: np.ndarray, errors: TrackingErrors, seed: int = 0
 ) -> list[np.ndarray | None]:
-    """Return rigid ``poses`` (n, 4, 4) [mm], reference from probe, as a tracker reports them: None where lost.
+    """Return rigid ``poses`` (n, 4, 4) [mm], reference from probe, as a tracker reports them: None where
+    lost.
 
-    In this order: latency; noise, with rotation about the probe's origin; calibration, on the image's side (``pose @ calibration``).
-    A ``seed`` draws the same pattern at every size of the errors, so that sizes can be compared.
-    Raises ValueError where ``times_s`` (n,) do not increase.
+    In this order: latency; noise, with rotation about the probe's origin; calibration, on the image's side
+    (``pose @ calibration``). A ``seed`` draws the same pattern at every size of the errors, so that sizes can
+    be compared. Raises ValueError where ``times_s`` (n,) do not increase.
     """
     if not (np.diff(times_s) > 0).all():
         raise ValueError("the times of poses must increase from each to the next")

@@ -118,7 +118,8 @@ def save_figures(figures: dict[str, Any], json_file: Path) -> None:
 def load_patient(
     scene: Path, changes: Mapping[str, Any] = MappingProxyType({}), quality: str | None = None
 ) -> tuple[Scene, "LoadedAnatomy"]:
-    """Load a scene file or a patient's folder, changed by options, and its anatomy; print the warnings of its import.
+    """Load a scene file or a patient's folder, changed by options, and its anatomy; print the warnings of its
+    import.
 
     Raises SceneError, PatientError.
     """
@@ -168,9 +169,11 @@ def _option(field: str) -> str:
 
 
 class CommandOptions(BaseModel):
-    """The arguments and options of a command: each field is one, with its default, its range, and as help the text below it.
+    """The arguments and options of a command: each field is one, with its default, its range, and as help the
+    text below it.
 
-    A type may carry names that are not the field's (``Annotated[float, "--cell"]``), ARGUMENT, or the ``click.Choice`` it is among.
+    A type may carry names that are not the field's (``Annotated[float, "--cell"]``), ARGUMENT, or the
+    ``click.Choice`` it is among.
     """
 
     model_config = ConfigDict(use_attribute_docstrings=True)
@@ -262,7 +265,9 @@ class ImageOptions(CommandOptions):
     detail_level: Annotated[DetailLevel | None, "--detail-level"] = None
     """Detail level (realism) of the B-mode image [the scene's]."""
     atlas: Annotated[bool | None, "--atlas/--no-atlas"] = None
-    """Draw from an atlas what the CT cannot show: pyramids without enhancement, the renal fascia, layers in muscle [the scene's]."""
+    """Draw from an atlas what the CT cannot show: pyramids without enhancement, the renal fascia, layers
+    in muscle [the scene's].
+    """
 
 
 class QualityOptions(CommandOptions):

@@ -53,12 +53,15 @@ def export(asked: ExportOptions) -> None:
     without = sum(not isinstance(shape, trimesh.Trimesh) for shape in anatomy.shapes)
     if without:
         click.echo(
-            f"Left out: {counted(without, 'shape')} under the organ; planes and distance fields are not surfaces."
+            f"Left out: {counted(without, 'shape')} under the organ; planes and distance fields are not "
+            "surfaces."
         )
 
 
 def surfaces(anatomy: LoadedAnatomy) -> dict[str, trimesh.Trimesh]:
-    """The surfaces of an anatomy, by the names of their files: organ, tumour, parts, support, support-2, ..."""
+    """The surfaces of an anatomy, by the names of their files: organ, tumour, parts, support, support-2,
+    ...
+    """
     found = {"organ": anatomy.organ}
     if anatomy.tumour is not None:
         found["tumour"] = anatomy.tumour
@@ -68,7 +71,10 @@ def surfaces(anatomy: LoadedAnatomy) -> dict[str, trimesh.Trimesh]:
 
 
 def save_volumes(scene: Scene, folder: Path, out: Path) -> list[str]:
-    """Write the voxels of CT and label map, unchanged and without metadata; return the names of the files. Raises OSError."""
+    """Write the voxels of CT and label map, unchanged and without metadata; return the names of the files.
+
+    Raises OSError.
+    """
     folder, files = files_of(scene, folder)
     wanted = {"ct.nrrd": files.ct, "labels.nrrd": files.labels}
     written = {name: file for name, file in wanted.items() if file}
@@ -78,7 +84,9 @@ def save_volumes(scene: Scene, folder: Path, out: Path) -> list[str]:
 
 
 def save_classes(scene: Scene, anatomy: LoadedAnatomy, out: Path) -> list[str]:
-    """Write the tissue of every voxel as a segmentation of 3D Slicer; return the names of the files, none without labels. Raises OSError."""
+    """Write the tissue of every voxel as a segmentation of 3D Slicer; return the names of the files, none
+    without labels. Raises OSError.
+    """
     if anatomy.ct is None or anatomy.labels is None:
         return []
     found = stored_tissue_map(anatomy.labels, anatomy, anatomy.ct, scene.image.atlas)

@@ -1,4 +1,6 @@
-"""A group of commands of which only the one that is called is imported: the others' libraries take seconds to load."""
+"""A group of commands of which only the one that is called is imported: the others' libraries take seconds
+to load.
+"""
 
 from collections.abc import Mapping
 from importlib import import_module
@@ -8,7 +10,9 @@ import click
 
 
 class LazyGroup(click.Group):
-    """``commands_at``: a command's name -> where it is ("module:function"), and its help in one line, for the group's own help."""
+    """``commands_at``: a command's name -> where it is ("module:function"), and its help in one line, for
+    the group's own help.
+    """
 
     def __init__(self, *args: Any, commands_at: Mapping[str, tuple[str, str]], **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

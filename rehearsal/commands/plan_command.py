@@ -39,7 +39,9 @@ class PlanOptions(QualityOptions):
     resect: bool = False
     """Plan a resection of the tumour with the margin, instead of a sweep of the probe."""
     target: Target | None = None
-    """What the sweep covers: the tumour, the tumour with its margin, or the whole organ [margin, or organ without a tumour]."""
+    """What the sweep covers: the tumour, the tumour with its margin, or the whole organ [margin, or organ
+    without a tumour].
+    """
     margin_mm: float = Field(5.0, ge=0, le=MOST_MARGIN_MM)
     """Width of the margin around the tumour."""
     trocar: tuple[float, float, float] | None = None
@@ -96,7 +98,8 @@ def plan(asked: PlanOptions) -> None:
         )
     )
     click.echo(
-        f"Wrote {counted(len(made.sweeps), 'sweep')} to {out}; follow the first with: {rehearse_command_line(asked.scene, out, asked.probe)}"
+        f"Wrote {counted(len(made.sweeps), 'sweep')} to {out}; follow the first with: "
+        f"{rehearse_command_line(asked.scene, out, asked.probe)}"
     )
 
 
@@ -130,7 +133,8 @@ def plan_resection(asked: PlanOptions) -> None:
     if asked.margin_mm > 0:
         click.echo("An enucleation has no margin: --margin-mm 0 plans one.")
     click.echo(
-        f"Wrote {counted(len(cuts), 'cut')} to {asked.out}, and a picture of the first to {picture}; rehearse the first in a window with: {rehearse_command_line(asked.scene, asked.out, asked.probe)}"
+        f"Wrote {counted(len(cuts), 'cut')} to {asked.out}, and a picture of the first to {picture}; "
+        f"rehearse the first in a window with: {rehearse_command_line(asked.scene, asked.out, asked.probe)}"
     )
 
 
@@ -139,7 +143,8 @@ def over_limit_warning(parts: dict[str, float], limit_mm: float) -> list[str]:
     if parts["compression_max_mm"] <= limit_mm:
         return []
     return [
-        f"WARNING the first sweep compresses the tissue by up to {parts['compression_max_mm']:.1f} mm, the limit is {limit_mm:g} mm "
+        f"WARNING the first sweep compresses the tissue by up to {parts['compression_max_mm']:.1f} mm, "
+        f"the limit is {limit_mm:g} mm "
         f"(exceeded at {100 * parts['over_limit']:.0f} % of its poses)"
     ]
 

@@ -39,7 +39,8 @@ from ultrasound.tracking_errors import TrackingErrors
 from version import VERSION
 
 MOST_REACH_MM = 5.0
-# A smaller scanned fraction of the organ is not compared; below the second, the summary calls it a small part.
+# A smaller scanned fraction of the organ is not compared; below the second, the summary calls it a small
+# part.
 LEAST_SCANNED, SMALL_SCANNED = 0.01, 0.3
 
 
@@ -62,7 +63,9 @@ class ReconstructOptions(ArchOptions):
     reach_mm: float | None = Field(None, ge=0, le=20)
     """Gaps up to twice this width are filled [the distance of most images]."""
     undo_compression: bool = False
-    """Compression correction: press the scene's organ along the tracked path, and move each pixel to its place at rest."""
+    """Compression correction: press the scene's organ along the tracked path, and move each pixel to its
+    place at rest.
+    """
     noise_mm: float = Field(0.0, ge=0)
     """Simulated tracker noise: SD of each coordinate."""
     noise_deg: float = Field(0.0, ge=0)
@@ -83,9 +86,10 @@ class ReconstructOptions(ArchOptions):
 def reconstruct(asked: ReconstructOptions) -> None:
     """Reconstruct a volume from SWEEP, a tracked sweep (.igs.mha, .igs.nrrd).
 
-    The sweep is from Nephron or PLUS. Writes volume.nrrd, volume.png and report.json; with ground-truth labels
-    (SWEEP-marks.igs.mha, which a rehearsal records) also organ and tumour in labels.nrrd. With simulated tracker
-    errors, it also writes the sweep that has them, tracked.igs.mha, or .igs.nrrd as the sweep.
+    The sweep is from Nephron or PLUS. Writes volume.nrrd, volume.png and report.json; with ground-truth
+    labels (SWEEP-marks.igs.mha, which a rehearsal records) also organ and tumour in labels.nrrd. With
+    simulated tracker errors, it also writes the sweep that has them, tracked.igs.mha, or .igs.nrrd as the
+    sweep.
     """
     out, reference = asked.out, asked.reference
     if asked.undo_compression and asked.scene is None:
@@ -162,7 +166,8 @@ def _compression_correction(
     sweep_probe = images.fields.get(PROBE_FIELD, probe.transducer_name)
     if sweep_probe != probe.transducer_name:
         raise CommandError(
-            f"--undo-compression: the sweep was made with the probe {sweep_probe}, the scene has {probe.transducer_name}: "
+            f"--undo-compression: the sweep was made with the probe {sweep_probe}, the scene has "
+            f"{probe.transducer_name}: "
             "set transducer.probe in the scene"
         )
     rehearsal = Rehearsal(case_of(scene, anatomy, probe), anatomy)
@@ -202,7 +207,8 @@ def _metrics(
     scanned = found["organ"]["scanned"] if "organ" in found else 0.0
     if scanned < LEAST_SCANNED:
         return {}, (
-            f"Not compared: the sweep covers {100 * scanned:.1f} % of this organ, so it is of another organ or patient. Name its own "
+            f"Not compared: the sweep covers {100 * scanned:.1f} % of this organ, so it is of another organ "
+            "or patient. Name its own "
             "scene with --scene."
         )
     return found, ""
@@ -211,10 +217,11 @@ def _metrics(
 def in_words(report: dict[str, Any]) -> str:
     """The main results, in a few lines for the terminal."""
     lines = [
-        f"images    {report['used']} of {report['frames']} with a pose, {report['between_median_mm']:.2f} mm apart (median; at most "
+        f"images    {report['used']} of {report['frames']} with a pose, "
+        f"{report['between_median_mm']:.2f} mm apart (median; at most "
         f"{report['between_max_mm']:.2f}), {report['speed_median_mm_s']:.0f} mm/s",
-        f"volume    {' x '.join(map(str, report['shape']))} voxels of {report['spacing_mm']:g} mm, {report['method']}"
-        + (", compression corrected" if report["undo_compression"] else ""),
+        f"volume    {' x '.join(map(str, report['shape']))} voxels of {report['spacing_mm']:g} mm, "
+        f"{report['method']}" + (", compression corrected" if report["undo_compression"] else ""),
     ]
     for name, figures in report["agreement"].items():
         line = f"{name:<9} {100 * figures['scanned']:.0f} % scanned"

@@ -18,7 +18,8 @@ from rehearsal.tracking.openigtlink_options import LinkOptions
 from scenes.scene import EMBEDDED, OPTIONS
 from scenes.tissue import TISSUES
 
-# Options that choose resolution and iterations, and the options of tissue and solver that each leaves to the user.
+# Options that choose resolution and iterations, and the options of tissue and solver that each leaves to the
+# user.
 MATERIAL = ("model", "young_kpa", "poisson")
 LEFT = {"quality": (*MATERIAL, "stiffness"), "budget_ms": MATERIAL, "error_mm": MATERIAL}
 TISSUE_AND_STEP = [field_of(name) for key, name in OPTIONS.items() if key.startswith(("tissue.", "solver."))]
@@ -62,17 +63,23 @@ class RehearseOptions(LinkOptions, ImageOptions, QualityOptions, ArchOptions):
     no_pictures: bool = False
     """With --headless: no images, which take most of the time; only report, surfaces and session."""
     seconds: float | None = Field(None, ge=0.02, le=3600)
-    """Simulated seconds without a window [the scene's press]; the scripted press takes this time; a track stops then, a replay so long after --at."""
+    """Simulated seconds without a window [the scene's press]; the scripted press takes this time; a track
+    stops then, a replay so long after --at.
+    """
     replay: Path | None = None
     """Replay a recorded session of this SCENE, bit for bit."""
     at: float = Field(0.0, ge=0)
     """With --replay: start at this second of the session."""
     track: Path | None = None
-    """Recorded poses that move the probe: a tracked sweep (.igs.mha, .igs.nrrd), or poses with times (CSV, JSON)."""
+    """Recorded poses that move the probe: a tracked sweep (.igs.mha, .igs.nrrd), or poses with times (CSV,
+    JSON).
+    """
     track_from: str | None = None
     """With --track: the sweep's transform from probe to patient [ProbeToReference]."""
     rate: float | None = Field(None, ge=15, le=1000)
-    """Steps a second in a window, as for a haptic device [60]; with a preset fast where nothing else chooses the tissue."""
+    """Steps a second in a window, as for a haptic device [60]; with a preset fast where nothing else
+    chooses the tissue.
+    """
     gamepad: bool = False
     """Use a gamepad beside mouse and keys."""
     keys: Path | None = None
@@ -98,7 +105,9 @@ class RehearseOptions(LinkOptions, ImageOptions, QualityOptions, ArchOptions):
     iterations: int | None = None
     """Iterations of the solver in a substep [the model's]."""
     budget_ms: float | None = Field(None, ge=0.01, le=10_000)
-    """Choose the most accurate resolution and iterations whose step takes no longer on this machine (measured first)."""
+    """Choose the most accurate resolution and iterations whose step takes no longer on this machine
+    (measured first).
+    """
     error_mm: float | None = Field(None, ge=0, le=100)
     """Choose the fastest resolution and iterations whose mean bead error (study trade) is no larger."""
 
@@ -109,7 +118,9 @@ class RehearseOptions(LinkOptions, ImageOptions, QualityOptions, ArchOptions):
         return "fast" if self.rate is not None and not chosen else self.quality
 
     def check(self) -> None:
-        """Raises CommandError for options that exclude each other, and for one without another that it needs."""
+        """Raises CommandError for options that exclude each other, and for one without another that it
+        needs.
+        """
         for table, wrong in ((EXCLUDING, 2), (NEEDING, 1)):
             for (first, second), text in table.items():
                 if self.given(first) and len(self.given(first, second)) == wrong:

@@ -47,7 +47,9 @@ class ScanOptions(ImageOptions, ArchOptions):
     clamped: bool = False
     """With --doppler: the renal hilum is clamped, and no blood flows in the kidney."""
     iq: Literal["npz", "mat"] | None = None
-    """Write IQ and RF signals of each B-mode image too, before gain, for NumPy or MATLAB, with the motion of the tissue."""
+    """Write IQ and RF signals of each B-mode image too, before gain, for NumPy or MATLAB, with the motion
+    of the tissue.
+    """
     sweep: bool = False
     """Write all images as one tracked sweep too (PLUS), with ground-truth labels."""
 
@@ -74,7 +76,8 @@ def scan(asked: ScanOptions) -> None:
     scan_probe, settings = probe_of(loaded), loaded.image
     if asked.mode_needs_b_mode and settings.mode == "ct":
         raise CommandError(
-            "--picture ct: --doppler and --iq are made from a B-mode image; leave them out, or choose both or b-mode"
+            "--picture ct: --doppler and --iq are made from a B-mode image; leave them out, or choose both "
+            "or b-mode"
         )
     if asked.iq is not None and settings.detail_level == "reflection":
         raise CommandError("--iq: the detail level reflection has no phase; choose speckle or elevation")
@@ -82,7 +85,8 @@ def scan(asked: ScanOptions) -> None:
         raise CommandError("--clamped: changes only Doppler; add --doppler colour or power, or leave it out")
     if asked.iq is not None and scan_probe.compound_angles > 1:
         raise CommandError(
-            f"--iq: CompoundAngles = {scan_probe.compound_angles} of the probe averages images, which have no one signal; "
+            f"--iq: CompoundAngles = {scan_probe.compound_angles} of the probe averages images, which have "
+            "no one signal; "
             "choose a probe with 1"
         )
     used = start_taichi(asked.arch)
@@ -114,11 +118,13 @@ def scan(asked: ScanOptions) -> None:
     write_json(report, out / "scan.json")
     if scans.empty:
         click.echo(
-            f"Warning: {scans.empty} of {len(pose_by_name)} poses show nothing of the organ; they may be of another patient."
+            f"Warning: {scans.empty} of {len(pose_by_name)} poses show nothing of the organ; they may be of "
+            "another patient."
         )
     sweep = ", sweep.igs.mha" if asked.sweep else ""
     click.echo(
-        f"Wrote {len(scans.rows)} images of {len(pose_by_name)} poses, scan.json{sweep} to {out}; {np.median(scans.ms):.1f} ms per pose (median)."
+        f"Wrote {len(scans.rows)} images of {len(pose_by_name)} poses, scan.json{sweep} to {out}; "
+        f"{np.median(scans.ms):.1f} ms per pose (median)."
     )
 
 
@@ -128,5 +134,6 @@ def warn_of_deep_poses(poses: Collection[np.ndarray], organ: trimesh.Trimesh) ->
     deep = int((signed_distance(organ.vertices, organ.faces, faces)[0] < -DEEP_MM).sum())
     if deep:
         click.echo(
-            f"Warning: {deep} of {len(poses)} poses are more than {DEEP_MM:g} mm inside the organ; they may be of another patient."
+            f"Warning: {deep} of {len(poses)} poses are more than {DEEP_MM:g} mm inside the organ; they may "
+            "be of another patient."
         )

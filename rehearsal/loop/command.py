@@ -1,6 +1,8 @@
-"""Commands: all that changes a rehearsal. The list of them, each with the number of the state that it was applied to, is a session's file.
+"""Commands: all that changes a rehearsal. The list of them, each with the number of the state that it was
+applied to, is a session's file.
 
-``Follow`` and ``Pause`` are for the clock of a ``Stepper`` alone: what is recorded are the moves that it makes of them.
+``Follow`` and ``Pause`` are for the clock of a ``Stepper`` alone: what is recorded are the moves that it
+makes of them.
 """
 
 from typing import Annotated, Any, Literal
@@ -29,7 +31,8 @@ def rigid_pose(value: Any) -> np.ndarray:
         raise ValueError("expected a pose of 4 x 4 numbers") from None
     if not are_rigid(pose[None]):
         raise ValueError(
-            f"a pose that is none of a probe: expected right-angled axes of length 1, and a place within {MOST_MM:g} mm"
+            "a pose that is none of a probe: expected right-angled axes of length 1, and a place within "
+            f"{MOST_MM:g} mm"
         )
     return pose
 
@@ -55,7 +58,9 @@ class _Command(BaseModel):
 
 
 class Move(_Command):
-    """One step of a length, at whose end the transducer has a pose; without a length, of the length that is set."""
+    """One step of a length, at whose end the transducer has a pose; without a length, of the length that
+    is set.
+    """
 
     kind: Literal["move"] = "move"
     pose: Pose
@@ -63,7 +68,8 @@ class Move(_Command):
 
 
 class Follow(_Command):
-    """The transducer follows the hand: to the pose that the hand had at a time [s] by the clock, a time [s] after the one before.
+    """The transducer follows the hand: to the pose that the hand had at a time [s] by the clock, a time [s]
+    after the one before.
 
     ``manipulator`` is the state of what the hand moves, which undo restores.
     """
@@ -82,21 +88,27 @@ class Pause(_Command):
 
 
 class SetValues(_Command):
-    """Settings by name: those of tissue and step change the steps from now on, all others only what is shown."""
+    """Settings by name: those of tissue and step change the steps from now on, all others only what is
+    shown.
+    """
 
     kind: Literal["set"] = "set"
     values: dict[str, bool | int | float | str | None]
 
 
 class BeginAction(_Command):
-    """An action of the user begins: undo restores the present state, with the manipulator's state before it."""
+    """An action of the user begins: undo restores the present state, with the manipulator's state before
+    it.
+    """
 
     kind: Literal["begin"] = "begin"
     manipulator: InstanceOf[ManipulatorState] | None = Field(None, exclude=True)
 
 
 class Mark(_Command):
-    """Marks of the score, at places of the organ's surface at rest [mm], beside those that are set or instead of them: an action."""
+    """Marks of the score, at places of the organ's surface at rest [mm], beside those that are set or
+    instead of them: an action.
+    """
 
     kind: Literal["mark"] = "mark"
     places_mm: Annotated[list[Place], Field(max_length=MOST_MARKS)]
@@ -104,7 +116,10 @@ class Mark(_Command):
 
 
 class CutOut(_Command):
-    """A cut along the score: an action. See ``CutSettings``; ``seen`` has a bit for each vertex of the tumour's surface, as base64."""
+    """A cut along the score: an action.
+
+    See ``CutSettings``; ``seen`` has a bit for each vertex of the tumour's surface, as base64.
+    """
 
     kind: Literal["cut"] = "cut"
     technique: Technique
@@ -152,8 +167,8 @@ class Checkpoint(_Command):
 
 
 class NewSession(_Command):
-    """A session begins with the present tissue, and with the transducer at a pose, where one is given, which is also where a reset
-    brings it.
+    """A session begins with the present tissue, and with the transducer at a pose, where one is given, which
+    is also where a reset brings it.
     """
 
     kind: Literal["new session"] = "new session"
@@ -161,7 +176,9 @@ class NewSession(_Command):
 
 
 class Load(_Command):
-    """Continue from a recorded state: that of a number, at a time [s] of its session; ``kept`` are states that may be restored from there."""
+    """Continue from a recorded state: that of a number, at a time [s] of its session; ``kept`` are states
+    that may be restored from there.
+    """
 
     kind: Literal["load"] = "load"
     state: InstanceOf[WholeState]

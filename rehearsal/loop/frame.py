@@ -21,8 +21,8 @@ NOT_SHOWN = "sinus"
 class RestGeometry:
     """The surfaces at rest [mm], of one version: a cut makes another one, and undo returns to the one before.
 
-    ``organ`` is what remains after a ``cut``; ``tumour`` and ``parts`` are what the cut leaves of them. ``interpolation`` is for points
-    of the tissue that is there, ``whole`` for those of the whole organ.
+    ``organ`` is what remains after a ``cut``; ``tumour`` and ``parts`` are what the cut leaves of them.
+    ``interpolation`` is for points of the tissue that is there, ``whole`` for those of the whole organ.
     """
 
     version: int
@@ -36,11 +36,13 @@ class RestGeometry:
 
 @dataclass(frozen=True)
 class Step:
-    """A step that was made from the state of a number: the transducer's pose (4, 4) at its end, its length [s], its iterations, the time
-    that it took [ms], the wrench (6,) on the probe. ``notice`` is the divergence check's, if it restored the state.
+    """A step that was made from the state of a number: the transducer's pose (4, 4) at its end, its length
+    [s], its iterations, the time that it took [ms], the wrench (6,) on the probe. ``notice`` is the
+    divergence check's, if it restored the state.
 
-    Where steps follow a clock, ``input_s`` is the time of the input that the pose shows, ``late_ms`` how much later than due the step
-    began, and ``awaited`` says whether it waited for its input, because steps had to become long.
+    Where steps follow a clock, ``input_s`` is the time of the input that the pose shows, ``late_ms`` how much
+    later than due the step began, and ``awaited`` says whether it waited for its input, because steps had to
+    become long.
     """
 
     number: int
@@ -57,7 +59,10 @@ class Step:
 
 @dataclass(frozen=True)
 class Applied:
-    """A command that was applied to the state of a number. ``restored`` is the number of the state that it restored, if it did."""
+    """A command that was applied to the state of a number.
+
+    ``restored`` is the number of the state that it restored, if it did.
+    """
 
     number: int
     command: Recorded
@@ -97,10 +102,11 @@ Event = Step | Applied | Refused | Digest | Checkpointed
 class Frame:
     """The newest state, and the events since the frame before.
 
-    ``number`` counts the states since the session began: each step and each command that changes the tissue makes another one.
-    ``positions`` (n, 3) [mm] are those of nodes or particles, ``frames`` (k, 4, 4) those of clusters where the tissue model has them.
-    ``wrench`` (6,): force [N] on the probe, and torque [N mm] about the centre of the array face (LPS). ``kept`` are the numbers of
-    the states that undo, redo and ``bookmarks`` may restore. ``pace`` says how steps differ from what is set.
+    ``number`` counts the states since the session began: each step and each command that changes the tissue
+    makes another one. ``positions`` (n, 3) [mm] are those of nodes or particles, ``frames`` (k, 4, 4) those
+    of clusters where the tissue model has them. ``wrench`` (6,): force [N] on the probe, and torque [N mm]
+    about the centre of the array face (LPS). ``kept`` are the numbers of the states that undo, redo and
+    ``bookmarks`` may restore. ``pace`` says how steps differ from what is set.
     """
 
     number: int

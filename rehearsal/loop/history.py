@@ -1,4 +1,7 @@
-"""Undo, redo and bookmarks as a value: the numbers of the states that they restore. ``Timeline`` keeps the states themselves."""
+"""Undo, redo and bookmarks as a value: the numbers of the states that they restore.
+
+``Timeline`` keeps the states themselves.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -7,7 +10,9 @@ MOST_UNDONE = 40
 
 @dataclass(frozen=True)
 class History:
-    """Numbers of states: ``before`` each action that can be undone, those that were ``undone``, and ``bookmarks``, the newest last."""
+    """Numbers of states: ``before`` each action that can be undone, those that were ``undone``, and
+    ``bookmarks``, the newest last.
+    """
 
     before: tuple[int, ...] = ()
     undone: tuple[int, ...] = ()
@@ -23,13 +28,17 @@ class History:
         return replace(self, before=(*self.before, now)[-MOST_UNDONE:], undone=())
 
     def undo(self, now: int) -> tuple["History", int | None]:
-        """The history after an undo in a state, and the state to restore; None where there is nothing to undo."""
+        """The history after an undo in a state, and the state to restore; None where there is nothing to
+        undo.
+        """
         if not self.before:
             return self, None
         return replace(self, before=self.before[:-1], undone=(*self.undone, now)), self.before[-1]
 
     def redo(self, now: int) -> tuple["History", int | None]:
-        """The history after a redo in a state, and the state to restore; None where there is nothing to redo."""
+        """The history after a redo in a state, and the state to restore; None where there is nothing to
+        redo.
+        """
         if not self.undone:
             return self, None
         before = (*self.before, now)[-MOST_UNDONE:]

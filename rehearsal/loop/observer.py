@@ -23,7 +23,9 @@ class Source(Protocol):
 
 
 class Observer(Protocol):
-    """Looks at each frame once, while the anatomy shows it and its image is there: measures, records, compares, announces."""
+    """Looks at each frame once, while the anatomy shows it and its image is there: measures, records,
+    compares, announces.
+    """
 
     def observe(self, frame: Frame, probe: Probe) -> None:
         """Look at a frame, and at the probe with the scanner's settings."""

@@ -9,7 +9,10 @@ from ultrasound.probe_manipulator import ManipulatorState
 
 @dataclass(frozen=True)
 class WholeState:
-    """All that commands change; steps from it give the same bits as before. ``manipulator`` is None where no hand has moved it."""
+    """All that commands change; steps from it give the same bits as before.
+
+    ``manipulator`` is None where no hand has moved it.
+    """
 
     organ: OrganState
     resection: Resection = NO_RESECTION

@@ -1,4 +1,6 @@
-"""Steppers turn commands into frames: in this process (``LocalStepper``), or in one of its own (``real_time.solver_process``)."""
+"""Steppers turn commands into frames: in this process (``LocalStepper``), or in one of its own
+(``real_time.solver_process``).
+"""
 
 from typing import Protocol
 
@@ -16,7 +18,10 @@ class Stepper(Protocol):
         """Have a command applied."""
 
     def newest(self, wait_s: float = 0.0) -> Frame:
-        """The newest frame, with the events since the last call. Where one that shows the newest input is due, wait for it so long."""
+        """The newest frame, with the events since the last call.
+
+        Where one that shows the newest input is due, wait for it so long.
+        """
         ...
 
     def wait(self, most_s: float = np.inf) -> None:

@@ -1,4 +1,5 @@
-"""The timeline, beside the solver: it applies commands, and keeps the states that undo, redo and bookmarks restore.
+"""The timeline, beside the solver: it applies commands, and keeps the states that undo, redo and bookmarks
+restore.
 
 It is deterministic: the same commands give the same states, events and bits, whoever gives them.
 """
@@ -59,7 +60,10 @@ KEPT_CUTS = 4
 
 
 class Timeline:
-    """The states of one organ. A command that cannot be applied changes nothing, and is an event with the reason."""
+    """The states of one organ.
+
+    A command that cannot be applied changes nothing, and is an event with the reason.
+    """
 
     def __init__(self, organ: PressedOrgan) -> None:
         self.organ = organ
@@ -109,7 +113,9 @@ class Timeline:
         late_ms: float = 0.0,
         awaited: bool = False,
     ) -> Step:
-        """Make a step of a length [s] with so many iterations, where given, and return it; for the others see ``Step``."""
+        """Make a step of a length [s] with so many iterations, where given, and return it; for the others
+        see ``Step``.
+        """
         settings = self.organ.settings
         length_s, iterations = length_s or settings.time_step_s, iterations or settings.iterations
         if iterations != self._noted_iterations:
@@ -161,7 +167,10 @@ class Timeline:
             self._checkpoint()
 
     def _do(self, command: Recorded) -> int | None:
-        """Apply a command; return the number of the state that it restored, if it did. Raises UserError, and nothing has changed."""
+        """Apply a command; return the number of the state that it restored, if it did.
+
+        Raises UserError, and nothing has changed.
+        """
         match command:
             case SetValues():
                 self._set(command.values)
@@ -229,7 +238,10 @@ class Timeline:
         return CutRequest(settings, base64.b64decode(command.seen), position)
 
     def _geometry_of(self, resection: Resection) -> RestGeometry:
-        """The geometry of a resection, whose cut is made if it was not. Raises ResectionError, PatientError."""
+        """The geometry of a resection, whose cut is made if it was not.
+
+        Raises ResectionError, PatientError.
+        """
         request, case = resection.cut, self.organ.case
         if request is None:
             return self._whole
@@ -263,12 +275,16 @@ class Timeline:
         self.geometry = replace(geometry, interpolation=self.organ.model.carrier.interpolation)
 
     def _restore(self, history: History, number: int | None, fault: str = "") -> int:
-        """Restore the state of a number; ``history`` is the one afterwards. Raises UserError where there is none."""
+        """Restore the state of a number; ``history`` is the one afterwards.
+
+        Raises UserError where there is none.
+        """
         if number is None:
             raise UserError(fault)
         self._keep()
         self.history = history
-        # First the tissue that is there: contact points that the cut moves lose their friction, which the state then restores.
+        # First the tissue that is there: contact points that the cut moves lose their friction, which the
+        # state then restores.
         state = self._kept[number]
         self._show(state.resection, self._geometry_of(state.resection))
         self.organ.restore(state.organ)
@@ -303,7 +319,10 @@ class Timeline:
             self._events.append(Digest(self.number, self.organ.digest()))
 
     def _checkpoint(self) -> None:
-        """Record the whole state. It also becomes what the divergence check would restore, so that it is recorded once."""
+        """Record the whole state.
+
+        It also becomes what the divergence check would restore, so that it is recorded once.
+        """
         self._digest()
         self.organ.store_valid_state()
         state = self.whole_state()

@@ -30,13 +30,15 @@ LEAST_CONTACT = 0.05
 COMPRESSION = "compression"
 # Commands after which the tissue is as it was before.
 RESTORES = "undo", "redo", "reset", "go to"
-# Digits of a recorded measurement, and of what the summary counts, so that the summary follows from the record.
+# Digits of a recorded measurement, and of what the summary counts, so that the summary follows from the
+# record.
 DIGITS = 4
 
 
 class LiveMeasurements:
-    """``latest`` is the last measurement, ``coverage`` that of the whole session, ``guide`` the guidance along a plan, ``bands`` how far
-    measurements may differ, if any. ``note`` is called with each measurement and the number of its state.
+    """``latest`` is the last measurement, ``coverage`` that of the whole session, ``guide`` the guidance
+    along a plan, ``bands`` how far measurements may differ, if any. ``note`` is called with each measurement
+    and the number of its state.
     """
 
     def __init__(
@@ -70,7 +72,8 @@ class LiveMeasurements:
             self.guide.restart()
 
     def recall(self, log: Log, until: int) -> bool:
-        """Restore the measurements of a session's first states if its file holds the coverage until then; return whether it does.
+        """Restore the measurements of a session's first states if its file holds the coverage until then;
+        return whether it does.
 
         Raises SessionError.
         """
@@ -79,7 +82,8 @@ class LiveMeasurements:
         seen = unpack_seen(log.seen[until])
         if seen.shape != self.coverage.seen.shape:
             raise SessionError(
-                f"the session has a coverage of {seen.shape} voxels, expected {self.coverage.seen.shape}: it is damaged, or of "
+                f"the session has a coverage of {seen.shape} voxels, expected {self.coverage.seen.shape}: it "
+                "is damaged, or of "
                 "another body"
             )
         self.coverage.seen = seen

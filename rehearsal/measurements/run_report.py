@@ -17,7 +17,9 @@ NOT_EVERYWHERE = dict(radius_mm=None, stiffness=None, clusters=0, memberships=0)
 
 
 def numerical_error_of(rehearsal: Rehearsal) -> float | None:
-    """Mean bead error [mm] on other kidneys, of known material, that ``study trade`` measured with similar settings; None if there are none."""
+    """Mean bead error [mm] on other kidneys, of known material, that ``study trade`` measured with similar
+    settings; None if there are none.
+    """
     case, step = rehearsal.case, rehearsal.organ.settings
     changed = {name: getattr(step, name) for name in STEP}
     setup = Setup(case.scene.tissue, case.scene.solver.model_copy(update=changed))
@@ -56,7 +58,9 @@ class Tally:
             self.force_max_n = max(self.force_max_n, float(np.linalg.norm(frame.wrench[:3])))
 
     def report(self, rehearsal: Rehearsal, arch: str) -> dict:
-        """The report; times [ms] without the first step, None if nothing was timed; no figures of tissue that is not finite."""
+        """The report; times [ms] without the first step, None if nothing was timed; no figures of tissue
+        that is not finite.
+        """
         case, settings = rehearsal.case, rehearsal.organ.settings
         wrench = rehearsal.frame.wrench if self.finite else None
         return dict(
@@ -109,11 +113,13 @@ def summary(report: dict) -> str:
     shown = f"image {report['picture']}, B-mode at detail level {report['detail_level']}"
     return "\n".join(
         [
-            f"model     {TISSUES[report['model']].report_line.format(**report)}, {report['tetrahedra']} tetrahedra",
+            f"model     {TISSUES[report['model']].report_line.format(**report)}, {report['tetrahedra']} "
+            "tetrahedra",
             *([f"parts     {_parts(report['parts'])}"] if report["parts"] else []),
             f"step      1/{1 / report['time_step_s']:.0f} s in {counted(report['substeps'], 'substep')} of "
             f"{counted(report['iterations'], 'iteration')}",
-            f"speed     {times} (medians of {report['steps']}) on {report['arch']}; built in {report['build_s']:.1f} s",
+            f"speed     {times} (medians of {report['steps']}) on {report['arch']}; built in "
+            f"{report['build_s']:.1f} s",
             f"probe     {report['probe']}; {shown if measured['image'] else 'no images'}",
             f"press     {_press(report)}",
             f"numerical {_error(report['numerical_error_mm'])}",
@@ -132,7 +138,8 @@ def _press(report: dict) -> str:
     if not report["finite"]:
         return "NOT FINITE: the tissue diverged, and there are no figures of it"
     return (
-        f"indentation {report['indentation_max_mm']:.2f} mm at most{_force(report['force_max_n'])}; least volume {100 * report['volume_ratio_min']:.1f} %; "
+        f"indentation {report['indentation_max_mm']:.2f} mm at most{_force(report['force_max_n'])}; "
+        f"least volume {100 * report['volume_ratio_min']:.1f} %; "
         f"penetration at most {report['max_penetration_mm']:.3f} mm; all finite"
     )
 
@@ -144,4 +151,7 @@ def _force(most_n: float | None) -> str:
 def _error(expected_mm: float | None) -> str:
     if expected_mm is None:
         return "error not known: study trade measured no similar settings"
-    return f"error {expected_mm:.2f} mm: mean bead error with similar settings on virtual kidneys (study trade), not the error on this one"
+    return (
+        f"error {expected_mm:.2f} mm: mean bead error with similar settings on virtual kidneys (study "
+        "trade), not the error on this one"
+    )

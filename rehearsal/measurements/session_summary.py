@@ -36,7 +36,9 @@ class SessionCourse:
     def add(
         self, pose: np.ndarray | None, compression_mm: float, length_s: float, force_n: float | None = None
     ) -> None:
-        """Add a step by its pose (4, 4), or a rollback by None, with compression [mm], length [s], and force on the probe [N]."""
+        """Add a step by its pose (4, 4), or a rollback by None, with compression [mm], length [s], and
+        force on the probe [N].
+        """
         self.duration_s += length_s
         if pose is None:
             self.went_back += 1
@@ -90,8 +92,10 @@ def summary_text(summary: dict[str, Any]) -> str:
         largest = f"; the largest region not imaged is {volume_ml:.1f} ml, up to {thickness_mm:.1f} mm thick"
     return "\n".join(
         [
-            f"session     {summary['duration_s']:.1f} s, {counted(summary['presses'], 'press')}, the path of the transducer "
-            f"{summary['path_mm']:.0f} mm, at most {summary['fastest_mm_s']:.0f} mm/s; {counted(summary['bookmarks'], 'bookmark')}",
+            f"session     {summary['duration_s']:.1f} s, {counted(summary['presses'], 'press')}, the path of "
+            "the transducer "
+            f"{summary['path_mm']:.0f} mm, at most {summary['fastest_mm_s']:.0f} mm/s; "
+            f"{counted(summary['bookmarks'], 'bookmark')}",
             f"compression {summary['compression_max_mm']:.1f} mm at most, also by the organ's own weight; "
             f"{summary['over_warning_s']:.1f} s above the limit of {summary['compression_warning_mm']:g} mm",
             *_force(summary["force_max_n"]),

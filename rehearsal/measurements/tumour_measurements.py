@@ -1,4 +1,6 @@
-"""Measurements for a partial nephrectomy: compression, contact, and the tumour's distance, depth, shift, visibility and margin."""
+"""Measurements for a partial nephrectomy: compression, contact, and the tumour's distance, depth, shift,
+visibility and margin.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +18,9 @@ class Measurement:
     """Lengths in mm, forces in N; None where there is no tumour, or none on the image plane."""
 
     compression_mm: float
-    """Greatest compression of the tissue in front of the array face (``ultrasound.array_contact.ArrayContact``)."""
+    """Greatest compression of the tissue in front of the array face
+    (``ultrasound.array_contact.ArrayContact``).
+    """
     contact_mm2: float
     """Area of the array face in contact."""
     to_tumour_mm: float | None = None

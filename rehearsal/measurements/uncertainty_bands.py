@@ -1,4 +1,6 @@
-"""The bands of ``study uncertainty`` for the panel: how far a measurement may differ, because the patient's tissue is not known."""
+"""The bands of ``study uncertainty`` for the panel: how far a measurement may differ, because the
+patient's tissue is not known.
+"""
 
 from pathlib import Path
 from typing import Literal
@@ -25,7 +27,9 @@ class Band(BaseModel):
 
 
 class UncertaintyBands(BaseModel):
-    """What the panel needs of uncertainty.json: the bands of each quantity at each depth of a press of this anatomy."""
+    """What the panel needs of uncertainty.json: the bands of each quantity at each depth of a press of
+    this anatomy.
+    """
 
     model_config = ConfigDict(allow_inf_nan=False)
 
@@ -45,7 +49,9 @@ class UncertaintyBands(BaseModel):
         return self
 
     def around(self, name: str, value: float, indentation_mm: float) -> tuple[float, float] | None:
-        """The 90 % band around a value at a depth, between the depths of the study; None for a quantity that it does not have."""
+        """The 90 % band around a value at a depth, between the depths of the study; None for a quantity
+        that it does not have.
+        """
         if not all(name in row for row in self.bands):
             return None
         bands = [row[name] for row in self.bands]

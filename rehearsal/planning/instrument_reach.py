@@ -15,8 +15,9 @@ def reachable(
 ) -> np.ndarray:
     """Which poses (n, 4, 4) over the settled organ are reachable, bool (n,); all are without a trocar.
 
-    ``origin`` (3,) is the rehearsal's origin in the patient [mm]. The shaft is straight, from the trocar to the centre of the probe's
-    back. Without an axis of its own, the trocar's cone is about the direction to ``target`` (3,).
+    ``origin`` (3,) is the rehearsal's origin in the patient [mm]. The shaft is straight, from the trocar to
+    the centre of the probe's back. Without an axis of its own, the trocar's cone is about the direction to
+    ``target`` (3,).
     """
     if trocar.at_mm is None:
         return np.ones(len(poses), bool)

@@ -1,4 +1,6 @@
-"""The kinds of pass that a sweep is made of: each has a few parameters with ranges, which define a pass over the organ."""
+"""The kinds of pass that a sweep is made of: each has a few parameters with ranges, which define a pass
+over the organ.
+"""
 
 from dataclasses import dataclass
 
@@ -8,16 +10,18 @@ from rehearsal.planning.sweep_path import FAR_MM, frame_towards, pose_over, slid
 from rehearsal.planning.sweep_trial import Trial
 from ultrasound.probe_manipulator import ProbeManipulator
 
-# Directions sampled around the organ; the smallest cosine of one to "above"; the smallest angle between two sides.
+# Directions sampled around the organ; the smallest cosine of one to "above"; the smallest angle between two
+# sides.
 DIRECTIONS, LEAST_COSINE, APART_DEG = 300, 0.1, 20.0
-# A sweep has at most a few passes; where more are needed side by side, as for a whole kidney, as many, up to the most.
+# A sweep has at most a few passes; where more are needed side by side, as for a whole kidney, as many, up to
+# the most.
 FEW_PASSES, MOST_PASSES = 4, 6
 # A target that is a single voxel counts as so wide.
 LEAST_MM = 0.1
 # Depth of an unplanned sweep below the settled surface: the middle of the range of a scene's press.
 DEFAULT_DEPTH_MM = 3.0
-# For each parameter its least and greatest value, and those at the beginning of a search. Places are relative to half of the target's
-# extent, across the pass and along it.
+# For each parameter its least and greatest value, and those at the beginning of a search. Places are relative
+# to half of the target's extent, across the pass and along it.
 COMMON = {
     "lean_deg": (-40.0, 40.0, -25.0, 25.0),
     "lean_aside_deg": (-40.0, 40.0, -25.0, 25.0),
@@ -45,8 +49,8 @@ RANGES = {
 class PassKind:
     """Passes of a ``motion``, "slide" or "tilt", on one side of the organ.
 
-    ``frame`` (4, 4) is at the centre of the target, with z towards that side; ``half_mm`` (2,) is half of the target's extent along its x
-    and y, ``width_mm`` the width of the image there.
+    ``frame`` (4, 4) is at the centre of the target, with z towards that side; ``half_mm`` (2,) is half of the
+    target's extent along its x and y, ``width_mm`` the width of the image there.
     """
 
     side: str
@@ -100,7 +104,9 @@ class PassKind:
         return int(np.clip(np.ceil(2 * self.extent_mm(heading_deg)[0] / self.width_mm), 1, MOST_PASSES))
 
     def rows(self) -> list[np.ndarray]:
-        """Straight passes side by side over the whole target, in two headings and two numbers: their parameters."""
+        """Straight passes side by side over the whole target, in two headings and two numbers: their
+        parameters.
+        """
         middle = {name: (low + high) / 2 for name, (_, _, low, high) in RANGES[self.motion].items()}
         found = []
         for heading in (0.0, 90.0):
@@ -126,7 +132,9 @@ class PassKind:
 
 
 def kinds_of(trial: Trial) -> list[PassKind]:
-    """Kinds of pass that may show the target: sliding from above, sliding and tilting from the side nearest to it."""
+    """Kinds of pass that may show the target: sliding from above, sliding and tilting from the side
+    nearest to it.
+    """
     above = -np.array(trial.case.press.direction)
     outwards = {"from above": above}
     nearest = nearest_side(trial)
@@ -141,8 +149,8 @@ def kinds_of(trial: Trial) -> list[PassKind]:
 def target_from(trial: Trial, outward: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, int]:
     """The target as seen from a direction (3,), for passes over it.
 
-    The frame (4, 4) at its centre, half of its extent (2,) across and along the passes, the width of the image at the centre with the
-    probe on the surface above it, and how many passes cover the extent.
+    The frame (4, 4) at its centre, half of its extent (2,) across and along the passes, the width of the
+    image at the centre with the probe on the surface above it, and how many passes cover the extent.
     """
     frame = frame_towards(trial.places.mean(axis=0), outward, np.array(trial.case.press.lateral))
     half = np.abs((trial.places - frame[:3, 3]) @ frame[:3, :2]).max(axis=0)
@@ -155,7 +163,9 @@ def target_from(trial: Trial, outward: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def nearest_side(trial: Trial) -> np.ndarray | None:
-    """The direction (3,) from the target to the nearest surface where a probe can be placed; None where there is none."""
+    """The direction (3,) from the target to the nearest surface where a probe can be placed; None where
+    there is none.
+    """
     manipulator, press, centre = trial.manipulator, trial.case.press, trial.places.mean(axis=0)
     least, found = np.inf, None
     for outward in directions(DIRECTIONS):

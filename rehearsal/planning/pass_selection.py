@@ -1,4 +1,5 @@
-"""Which of the tried passes make the best sweep together: the score of any set of passes follows from what each has shown alone.
+"""Which of the tried passes make the best sweep together: the score of any set of passes follows from what
+each has shown alone.
 
 Coverage is that of their union, and the means are over all of their poses.
 """
@@ -16,7 +17,9 @@ BEGINNINGS = 12
 
 
 class PassPool:
-    """Tried passes as arrays, so that sets of them have their scores at once; a set is a list of their numbers."""
+    """Tried passes as arrays, so that sets of them have their scores at once; a set is a list of their
+    numbers.
+    """
 
     def __init__(self, passes: Sequence[TriedPass]) -> None:
         weight = {name: points for name, (points, *_) in WORDING.items()}
@@ -30,7 +33,9 @@ class PassPool:
         )
 
     def scores_with(self, chosen: list[int]) -> np.ndarray:
-        """The score (k,) of a set of passes, together with each other one; minus infinity for those of the set."""
+        """The score (k,) of a set of passes, together with each other one; minus infinity for those of the
+        set.
+        """
         unseen = 1.0 - self._seen[chosen].max(axis=0, initial=0.0)
         seen = self._seen @ unseen + (len(unseen) - unseen.sum())
         means = (self._means + self._means[chosen].sum()) / (self._poses + self._poses[chosen].sum())
@@ -44,7 +49,9 @@ class PassPool:
         return float(self.scores_with(chosen[1:])[chosen[0]]) if chosen else -np.inf
 
     def best(self, most: int) -> list[int]:
-        """The passes, at most so many, that have the best score together: by adding, exchanging and removing passes while that makes it better."""
+        """The passes, at most so many, that have the best score together: by adding, exchanging and
+        removing passes while that makes it better.
+        """
         begins = np.argsort(-self.scores_with([]), kind="stable")[:BEGINNINGS]
         return max((self._improved([int(begin)], most) for begin in begins), key=self.score)
 

@@ -1,4 +1,7 @@
-"""The file of a plan: sweeps over a target, the best first, with their scores. JSON; patient coordinates LPS, mm."""
+"""The file of a plan: sweeps over a target, the best first, with their scores.
+
+JSON; patient coordinates LPS, mm.
+"""
 
 import json
 from itertools import pairwise
@@ -55,8 +58,10 @@ class _FileModel(BaseModel):
 class PlannedSweep(_FileModel):
     """One candidate.
 
-    ``parts`` are its ``ScoreTerms`` by name, ``points`` what each adds to the score, ``trials`` the passes that were tried for it.
-    ``transfers`` are poses from each pass to above the next, outside the organ. ``passes`` are its poses, probe to patient; the probe's axes are PLUS's (``ultrasound.probe_manipulator``).
+    ``parts`` are its ``ScoreTerms`` by name, ``points`` what each adds to the score, ``trials`` the passes
+    that were tried for it. ``transfers`` are poses from each pass to above the next, outside the organ.
+    ``passes`` are its poses, probe to patient; the probe's axes are PLUS's
+    (``ultrasound.probe_manipulator``).
     """
 
     name: str
@@ -93,7 +98,9 @@ class PlannedSweep(_FileModel):
 
 
 class Plan(_FileModel):
-    """``version`` is the Nephron that made it, ``anatomy`` the fingerprint of the patient's files, ``why`` the reasons for the order."""
+    """``version`` is the Nephron that made it, ``anatomy`` the fingerprint of the patient's files, ``why``
+    the reasons for the order.
+    """
 
     nephron_plan: int = FORMAT
     version: str | None = None
@@ -150,7 +157,9 @@ def read_plan(path: Path) -> Plan:
 
 
 def timed_poses(sweep: PlannedSweep, speed_mm_s: float) -> TimedPoses:
-    """The poses of a sweep with times, at a speed on its passes; the probe starts above the first pose and is lifted between passes."""
+    """The poses of a sweep with times, at a speed on its passes; the probe starts above the first pose and
+    is lifted between passes.
+    """
     poses: list[np.ndarray] = []
     speeds: list[float] = []
     passes = sweep.poses()
@@ -172,6 +181,8 @@ def _lifted(pose: np.ndarray) -> np.ndarray:
 
 
 def _length_mm(start: np.ndarray, end: np.ndarray) -> float:
-    """The length of a move, with rotations counted as a length; at least a micrometre, because times must increase."""
+    """The length of a move, with rotations counted as a length; at least a micrometre, because times must
+    increase.
+    """
     angle = np.degrees(Rotation.from_matrix(end[:3, :3] @ start[:3, :3].T).magnitude())
     return max(float(np.linalg.norm(end[:3, 3] - start[:3, 3])), float(angle) / DEG_PER_MM, 1e-3)

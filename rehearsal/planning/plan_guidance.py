@@ -24,8 +24,8 @@ ABOVE_MM = 1.5
 class _Progress(NamedTuple):
     """How far a sweep was followed.
 
-    ``next`` is the index of the next pose. Of each pose, ``deviation`` (n, 2) is the least so far [mm, degrees], and ``combined_mm``
-    (n,) is both together.
+    ``next`` is the index of the next pose. Of each pose, ``deviation`` (n, 2) is the least so far [mm,
+    degrees], and ``combined_mm`` (n,) is both together.
     """
 
     next: int
@@ -34,7 +34,10 @@ class _Progress(NamedTuple):
 
 
 class PlanGuidance:
-    """Guides along one sweep of a plan. ``number`` is the index of the sweep; one past the last shows none."""
+    """Guides along one sweep of a plan.
+
+    ``number`` is the index of the sweep; one past the last shows none.
+    """
 
     def __init__(self, case: Case, manipulator: ProbeManipulator, plan: Plan, number: int = 0) -> None:
         self.case, self.manipulator, self.plan, self.number = case, manipulator, plan, number
@@ -107,7 +110,9 @@ class PlanGuidance:
         self._progress = _Progress(at, deviation, combined)
 
     def _deviation(self, pose: np.ndarray, others: np.ndarray) -> np.ndarray:
-        """The distances of a pose from others (n, 4, 4), (n, 2): of the centre of the array face [mm], and angular [degrees]."""
+        """The distances of a pose from others (n, 4, 4), (n, 2): of the centre of the array face [mm], and
+        angular [degrees].
+        """
         manipulator = self.manipulator
         away = np.linalg.norm(
             face_centres(manipulator, others) - face_centres(manipulator, pose[None]), axis=1
@@ -116,7 +121,9 @@ class PlanGuidance:
         return np.column_stack([away, np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))])
 
     def figures(self) -> dict[str, float | None]:
-        """The completed fraction of the sweep, 0 to 1, and the mean deviation over the completed poses; empty where none is shown."""
+        """The completed fraction of the sweep, 0 to 1, and the mean deviation over the completed poses;
+        empty where none is shown.
+        """
         if not self._is_shown:
             return {}
         followed = self.next_pose / len(self._poses) if len(self._poses) else 0.0
@@ -133,7 +140,9 @@ class PlanGuidance:
         return Guidance(goal, self._segments, self._segment_ends < self.next_pose)
 
     def in_words(self, coverage: float | None) -> str:
-        """A line for the terminal, with the coverage of the target that was reached; empty where no sweep is shown."""
+        """A line for the terminal, with the coverage of the target that was reached; empty where no sweep
+        is shown.
+        """
         if not self._is_shown:
             return ""
         sweep, figures = self.plan.sweeps[self.number], self.figures()
@@ -143,7 +152,10 @@ class PlanGuidance:
                 f", mean deviation {figures['plan_off_mm']:.1f} mm and {figures['plan_off_deg']:.0f} degrees"
             )
         if coverage is not None:
-            text += f"; coverage of {self.plan.target} {100 * coverage:.0f} % (planned {100 * sweep.coverage:.0f} %)"
+            text += (
+                f"; coverage of {self.plan.target} {100 * coverage:.0f} % (planned "
+                f"{100 * sweep.coverage:.0f} %)"
+            )
         return text
 
 

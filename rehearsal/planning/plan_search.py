@@ -1,7 +1,8 @@
-"""The search for a plan: passes varied on the rigid surrogate, then in trials on the deforming organ; the best sets of them are ranked.
+"""The search for a plan: passes varied on the rigid surrogate, then in trials on the deforming organ; the
+best sets of them are ranked.
 
-Both stages are an evolution strategy (Beyer & Schwefel 2002, "Evolution strategies: a comprehensive introduction"): the best set of the
-passes tried so far is varied by random changes.
+Both stages are an evolution strategy (Beyer & Schwefel 2002, "Evolution strategies: a comprehensive
+introduction"): the best set of the passes tried so far is varied by random changes.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,7 +29,8 @@ from rehearsal.planning.trial_workers import Trials
 from version import VERSION
 
 SEED = 20161130
-# On the rigid surrogate: passes at the beginning, rounds of variations, variations in each. They take as long as so many trials.
+# On the rigid surrogate: passes at the beginning, rounds of variations, variations in each. They take as long
+# as so many trials.
 BEGINNING, ROUNDS, VARIATIONS, SURROGATE_TRIALS = 150, 6, 25, 4
 # Standard deviation of a variation, as a fraction of a parameter's range: on the surrogate, and in trials.
 SURROGATE_SIGMA, TRIAL_SIGMA = 0.08, 0.06
@@ -38,12 +40,16 @@ ROUND_TRIALS = 8
 USUAL_PATH_MM = 250.0
 DIGITS = 6
 Progress = Callable[[int], Any]
-# The score terms of a path, the poses (n, 4, 4) of its passes: probe in the patient, in PLUS's axes (LPS, mm), and those from each to the next.
+# The score terms of a path, the poses (n, 4, 4) of its passes: probe in the patient, in PLUS's axes (LPS,
+# mm), and those from each to the next.
 TriedPath = tuple[ScoreTerms, list[np.ndarray], list[np.ndarray]]
 
 
 class PassSearch:
-    """The search for the best set of passes of one kind; deterministic. ``tried`` are the passes so far, ``best`` the best set of them."""
+    """The search for the best set of passes of one kind; deterministic.
+
+    ``tried`` are the passes so far, ``best`` the best set of them.
+    """
 
     def __init__(self, kind: PassKind, sigma: float) -> None:
         self.kind, self.sigma = kind, sigma
@@ -62,7 +68,9 @@ class PassSearch:
         return rows + self.kind.random(self._random, count - len(rows))
 
     def variations(self, count: int) -> list[np.ndarray]:
-        """Parameters of the best set's passes with random changes: of each pass a large one, then a small one."""
+        """Parameters of the best set's passes with random changes: of each pass a large one, then a small
+        one.
+        """
         found = []
         for number in range(count if self.best else 0):
             times, which = divmod(number, len(self.best))
@@ -151,7 +159,8 @@ def work_at(speed_mm_s: float) -> int:
 def make_plan(workers: Trials, speed_mm_s: float, trials: int, progress: Progress) -> Plan:
     """Search a plan for the workers' problem. Raises PlanError where no sweep is reachable.
 
-    ``progress`` is called with 0 when the search begins, then with the work done, in trials; the sum is at most ``total_work``.
+    ``progress`` is called with 0 when the search begins, then with the work done, in trials; the sum is at
+    most ``total_work``.
     """
     problem = workers.problem
     ((kinds, model),) = workers.map(search_space, [()])
@@ -159,7 +168,8 @@ def make_plan(workers: Trials, speed_mm_s: float, trials: int, progress: Progres
     searches = search(kinds, workers, trials, progress)
     if not searches:
         raise PlanError(
-            "no sweep was found that an instrument through the trocar can hold at all poses, and that starts outside the organ; move the "
+            "no sweep was found that an instrument through the trocar can hold at all poses, and that starts "
+            "outside the organ; move the "
             "trocar, widen its cone, or give the search more --trials"
         )
     rows = ranked(searches, workers, speed_mm_s, progress)
@@ -196,7 +206,9 @@ def make_plan(workers: Trials, speed_mm_s: float, trials: int, progress: Progres
 
 
 def search(kinds: list[PassKind], workers: Trials, trials: int, progress: Progress) -> list[PassSearch]:
-    """The kinds with the best sets on the surrogate, and their searches in so many trials; the better one gets what is left after the first round."""
+    """The kinds with the best sets on the surrogate, and their searches in so many trials; the better one
+    gets what is left after the first round.
+    """
     rough = []
     for kind, best in zip(kinds, workers.map(surrogate_search, [(kind,) for kind in kinds]), strict=True):
         progress(SURROGATE_TRIALS)

@@ -1,4 +1,6 @@
-"""Planning in the window: a plan is searched while the rehearsal continues; then its sweeps are shown one by one."""
+"""Planning in the window: a plan is searched while the rehearsal continues; then its sweeps are shown one
+by one.
+"""
 
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
@@ -30,7 +32,9 @@ TARGET_NAMES: dict[Target, str] = {
 
 
 class PlanJob:
-    """One search for a plan, in processes of its own; a thread waits for them, and writes ``result``, the plan, to a file."""
+    """One search for a plan, in processes of its own; a thread waits for them, and writes ``result``, the
+    plan, to a file.
+    """
 
     def __init__(self, problem: PlanningProblem, path: Path) -> None:
         self.path, self._problem = path, problem

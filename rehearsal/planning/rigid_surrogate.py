@@ -1,4 +1,7 @@
-"""The rigid surrogate: what a pass shows if the settled organ does not deform. Rough, and a hundred times faster than a trial."""
+"""The rigid surrogate: what a pass shows if the settled organ does not deform.
+
+Rough, and a hundred times faster than a trial.
+"""
 
 import copy
 
@@ -18,7 +21,10 @@ ELEMENTS = 32
 
 
 class RigidSurrogate:
-    """Evaluates passes on the settled organ of a trial. Its ``manipulator`` has fewer samples of the surface than the trial's."""
+    """Evaluates passes on the settled organ of a trial.
+
+    Its ``manipulator`` has fewer samples of the surface than the trial's.
+    """
 
     def __init__(self, trial: Trial) -> None:
         self.trial = trial
@@ -34,7 +40,10 @@ class RigidSurrogate:
         self._elements = elements[np.linspace(0, len(elements) - 1, ELEMENTS).astype(int)]
 
     def try_pass(self, kind: PassKind, parameters: np.ndarray) -> TriedPass | None:
-        """A pass over the rigid organ; None where the instrument cannot hold it. Compression is the depth of the array below the surface."""
+        """A pass over the rigid organ; None where the instrument cannot hold it.
+
+        Compression is the depth of the array below the surface.
+        """
         poses = kind.poses(self.manipulator, kind.values(parameters))
         if poses is None or not self.trial.held([poses]).all():
             return None
@@ -48,7 +57,9 @@ class RigidSurrogate:
         )
 
     def _outside_mm(self, planes: np.ndarray) -> np.ndarray:
-        """The signed distance (n, k) of each element on planes (n, 4, 4) from the settled surface, negative inside."""
+        """The signed distance (n, k) of each element on planes (n, 4, 4) from the settled surface,
+        negative inside.
+        """
         places = np.einsum("kj,nij->nki", self._elements, planes[:, :3, :2]) + planes[:, None, :3, 3]
         at = ((places - self._low_mm) / VOXEL_MM).reshape(-1, 3).T
         return map_coordinates(self._distance, at, order=1, mode="nearest").reshape(places.shape[:2])

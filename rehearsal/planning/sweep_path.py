@@ -1,7 +1,8 @@
 """Paths of the probe over the settled organ: parallel passes, in each of which the probe slides or tilts.
 
-A path is a list of passes, each the poses (n, 4, 4) of a probe in contact; between passes the probe is lifted. A frame (4, 4) of
-``frame_towards`` places the passes: x is across them, y along them, z away from the organ, and its origin [mm] is their centre.
+A path is a list of passes, each the poses (n, 4, 4) of a probe in contact; between passes the probe is
+lifted. A frame (4, 4) of ``frame_towards`` places the passes: x is across them, y along them, z away from the
+organ, and its origin [mm] is their centre.
 """
 
 import numpy as np
@@ -20,7 +21,8 @@ from ultrasound.probe_manipulator import (
 
 # Largest distance and angle between poses of a pass.
 STEP_MM, STEP_DEG = 1.5, 2.0
-# Lifts between two passes [mm], of which the least is taken that keeps the probe outside the organ, on ways at these steps.
+# Lifts between two passes [mm], of which the least is taken that keeps the probe outside the organ, on ways
+# at these steps.
 LIFTS_MM, WAY_MM, ARC_DEG = (LIFT_MM, 12.0, 24.0, 48.0, 96.0), 3.0, 15.0
 # Rays towards the organ's surface start this far outside [mm].
 FAR_MM = 300.0
@@ -50,8 +52,8 @@ def sliding(
 ) -> list[np.ndarray]:
     """Passes along the surface at lateral offsets (k,), each from a start to an end along the frame's y.
 
-    The array face is ``depth_mm`` below the settled surface. The probe's axis is the frame's z (``follow`` 0) or the surface normal (1).
-    A pass ends where the organ ends; every second pass runs backwards.
+    The array face is ``depth_mm`` below the settled surface. The probe's axis is the frame's z (``follow`` 0)
+    or the surface normal (1). A pass ends where the organ ends; every second pass runs backwards.
     """
     count = max(2, int(np.ceil(abs(end_mm - start_mm) / STEP_MM)) + 1)
     passes = []
@@ -76,7 +78,9 @@ def tilting(
     angles_deg: tuple[float, float],
     depth_mm: float,
 ) -> list[np.ndarray]:
-    """Passes at lateral offsets (k,), in each of which the probe tilts out of its image plane about the centre of the array face."""
+    """Passes at lateral offsets (k,), in each of which the probe tilts out of its image plane about the
+    centre of the array face.
+    """
     count = max(2, int(np.ceil(abs(angles_deg[1] - angles_deg[0]) / STEP_DEG)) + 1)
     passes = []
     for number, aside in enumerate(aside_mm):
@@ -88,9 +92,11 @@ def tilting(
 
 
 def transfer(manipulator: ProbeManipulator, end: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """The poses (n, 4, 4) of the probe, from the end of a pass to above the start of the next, which keep it outside the settled organ.
+    """The poses (n, 4, 4) of the probe, from the end of a pass to above the start of the next, which keep it
+    outside the settled organ.
 
-    It is lifted off, moves straight, at the least of ``LIFTS_MM`` at which that is possible, or else around the organ, and is lowered.
+    It is lifted off, moves straight, at the least of ``LIFTS_MM`` at which that is possible, or else around
+    the organ, and is lowered.
     """
     above = advanced(start, -LIFTS_MM[0])
     for lift in LIFTS_MM:

@@ -6,8 +6,8 @@ import numpy as np
 
 from ultrasound.probe_manipulator import ProbeManipulator
 
-# For each term: the points per unit (full coverage of the target gives 100, costs are subtracted), the verb phrase, the factor from
-# the value to the one that is printed, and the format of that.
+# For each term: the points per unit (full coverage of the target gives 100, costs are subtracted), the verb
+# phrase, the factor from the value to the one that is printed, and the format of that.
 WORDING = {
     "seen": (100.0, "covers {} of the target", 100, "{:.0f} %"),
     "compression_mean_mm": (-3.0, "compresses the tissue by {} on average", 1, "{:.1f} mm"),
@@ -23,14 +23,19 @@ UNREACHABLE = -300.0
 
 @dataclass(frozen=True)
 class ScoreTerms:
-    """What a sweep achieves and costs, under the names of the plan file. Means are over its poses; all are 0 without poses."""
+    """What a sweep achieves and costs, under the names of the plan file.
+
+    Means are over its poses; all are 0 without poses.
+    """
 
     seen: float = 0.0
     """Coverage: fraction of the target that was in the image plane under contact, 0 to 1."""
     compression_mean_mm: float = 0.0
     compression_max_mm: float = 0.0
     over_limit: float = 0.0
-    """Fraction of poses with more compression than the scene's warning, or with a state restored by the divergence check."""
+    """Fraction of poses with more compression than the scene's warning, or with a state restored by the
+    divergence check.
+    """
     contact: float = 0.0
     """Fraction of the scanlines in contact."""
     incidence_deg: float = 0.0
@@ -48,7 +53,8 @@ MEANS = ("compression_mean_mm", "over_limit", "contact", "incidence_deg")
 
 @dataclass(frozen=True)
 class TriedPass:
-    """``parameters`` (n,) of a pass, scaled to 0 to 1, and what it does alone: ``seen`` (p,), sampled places of the target, and its ``path_mm``.
+    """``parameters`` (n,) of a pass, scaled to 0 to 1, and what it does alone: ``seen`` (p,), sampled places
+    of the target, and its ``path_mm``.
 
     ``sums`` (4,) are the ``MEANS``, summed over its ``poses``.
     """

@@ -32,7 +32,10 @@ ROUNDED_STEPS = 1e-3
 
 @dataclass(frozen=True)
 class PlanningProblem:
-    """The target of a patient that a plan is to cover. Raises PlanError for a tumour target without a tumour."""
+    """The target of a patient that a plan is to cover.
+
+    Raises PlanError for a tumour target without a tumour.
+    """
 
     scene: Scene
     anatomy: LoadedAnatomy
@@ -56,7 +59,9 @@ class PlanningProblem:
 
     @property
     def without_images(self) -> "PlanningProblem":
-        """The same without CT and labels, and without parts that have no material of their own, which no trial needs."""
+        """The same without CT and labels, and without parts that have no material of their own, which no
+        trial needs.
+        """
         material = getattr(self.scene.tissue, "parts", {})
         parts = {name: part for name, part in self.anatomy.parts.items() if name in material}
         bare = replace(self.anatomy, ct=None, labels=None, parts=parts)
@@ -78,7 +83,8 @@ class Trial:
         self.places = self.coverage.voxel_centres(self.target)
         if len(self.places) == 0:
             raise PlanError(
-                f"--target {self.target}: it is smaller than a voxel of {VOXEL_MM:g} mm; expected a larger one"
+                f"--target {self.target}: it is smaller than a voxel of {VOXEL_MM:g} mm; expected a larger "
+                "one"
             )
         self._sampled = slice(None, None, -(-len(self.places) // PLACES))
         self.sampled_places = self.places[self._sampled]
@@ -114,7 +120,9 @@ class Trial:
         restored: np.ndarray | bool = False,
         **others: float,
     ) -> ScoreTerms:
-        """The terms of a path, from the compression and contact at each of its poses and whether a state was restored before it."""
+        """The terms of a path, from the compression and contact at each of its poses and whether a state
+        was restored before it.
+        """
         if not passes:
             return ScoreTerms()
         compression, poses = np.array(compression_mm), np.concatenate(passes)
@@ -159,7 +167,9 @@ class Trial:
         return [transfer(self.manipulator, one[-1], other[0]) for one, other in pairwise(passes)]
 
     def held(self, passes: list[np.ndarray]) -> np.ndarray:
-        """Whether the instrument can hold each pose; and whether the probe can be lifted off the organ from both ends of each pass."""
+        """Whether the instrument can hold each pose; and whether the probe can be lifted off the organ
+        from both ends of each pass.
+        """
         # In a hollow of the organ it would meet another part of it.
         lifted = [advanced(pose, -lift) for each in passes for pose in each[[0, -1]] for lift in LIFTS_MM]
         clear = clear_of_organ(self.manipulator, np.array(lifted))

@@ -14,7 +14,9 @@ class Trials(Protocol):
     problem: PlanningProblem
 
     def map(self, function: Callable, tasks: Sequence[tuple]) -> Iterator[Any]:
-        """The results of ``function(trial, *task)`` in the order of the tasks, each as soon as it is there."""
+        """The results of ``function(trial, *task)`` in the order of the tasks, each as soon as it is
+        there.
+        """
 
 
 class TrialWorkers:

@@ -1,4 +1,6 @@
-"""How fast the window is: pictures a second, simulated over real time, and the time from an input to the picture that shows it."""
+"""How fast the window is: pictures a second, simulated over real time, and the time from an input to the
+picture that shows it.
+"""
 
 from collections import defaultdict, deque
 from collections.abc import Iterator
@@ -17,8 +19,8 @@ MOST_FRAMES = 20_000
 
 
 class FrameTimes:
-    """``stages_ms`` are the times of each part of a frame; ``latency_ms`` from an input to the end of the frame that shows it; ``steps``
-    are the steps in between."""
+    """``stages_ms`` are the times of each part of a frame; ``latency_ms`` from an input to the end of the
+    frame that shows it; ``steps`` are the steps in between."""
 
     def __init__(self) -> None:
         self.stages_ms: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=MOST_FRAMES))
@@ -35,7 +37,9 @@ class FrameTimes:
         self.stages_ms[name].append(1000 * (perf_counter() - start))
 
     def end_frame(self, simulated_s: float, input_s: float | None) -> None:
-        """A frame was shown: at a simulated time [s], with the transducer where an input had it at a time [s]."""
+        """A frame was shown: at a simulated time [s], with the transducer where an input had it at a time
+        [s].
+        """
         now = perf_counter()
         self.ends_s.append((now, simulated_s))
         if input_s is not None:
@@ -46,7 +50,9 @@ class FrameTimes:
         self.ends_s.clear()
 
     def rates(self, recent_s: float = np.inf) -> tuple[float, float]:
-        """Return frames a second and the real-time factor, over the last seconds; 0, 1 where too little is known."""
+        """Return frames a second and the real-time factor, over the last seconds; 0, 1 where too little is
+        known.
+        """
         last_s = self.ends_s[-1][0] if self.ends_s else 0.0
         # The newest first: after an hour there are many older ones.
         recent = list(takewhile(lambda end: last_s - end[0] <= recent_s, reversed(self.ends_s)))

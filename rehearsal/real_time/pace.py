@@ -1,4 +1,6 @@
-"""The pace of the steps: simulated time keeps up with the clock, by longer steps and then by fewer iterations where it must."""
+"""The pace of the steps: simulated time keeps up with the clock, by longer steps and then by fewer
+iterations where it must.
+"""
 
 from collections import deque
 from dataclasses import dataclass, replace
@@ -8,11 +10,12 @@ import numpy as np
 
 LEAST_ITERATIONS = 2
 LONGEST_STEP_S = 1 / 15
-# Steps that had to become longer than this wait for the user's input, to show it at once, until so much time is to be simulated.
+# Steps that had to become longer than this wait for the user's input, to show it at once, until so much time
+# is to be simulated.
 SHORT_STEP_S, MOST_WAIT_S = 1 / 60, 0.1
 ROUNDING = 1e-6
-# A level is left for a cheaper one when its steps take more than BUSY of the time that they simulate, and for a dearer one when that
-# one's would take less than SPARE: the median of so many steps.
+# A level is left for a cheaper one when its steps take more than BUSY of the time that they simulate, and for
+# a dearer one when that one's would take less than SPARE: the median of so many steps.
 BUSY, SPARE = 0.5, 0.35
 STEPS_DOWN, STEPS_UP = 12, 90
 
@@ -25,7 +28,8 @@ class Level:
     iterations: float = 1.0
 
 
-# An implicit step comes to the same rest at each length, and with fewer iterations to the same rest later: so steps get longer first.
+# An implicit step comes to the same rest at each length, and with fewer iterations to the same rest later: so
+# steps get longer first.
 TIMES_LONGER = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 FEWER_ITERATIONS = (0.75, 0.5, 0.25)
 
@@ -33,8 +37,8 @@ FEWER_ITERATIONS = (0.75, 0.5, 0.25)
 class Pace:
     """Chooses length and iterations of the steps by the time that they take.
 
-    ``time_step_s`` is the length that steps have where the machine can. ``budget_ms`` is a limit for the time of a step, beside the one that it simulates.
-    ``level`` 0 is that length with all iterations.
+    ``time_step_s`` is the length that steps have where the machine can. ``budget_ms`` is a limit for the time
+    of a step, beside the one that it simulates. ``level`` 0 is that length with all iterations.
     """
 
     def __init__(self, time_step_s: float, budget_ms: float = np.inf) -> None:
@@ -56,7 +60,8 @@ class Pace:
         return self.level > 0 and self.length_s > SHORT_STEP_S + ROUNDING
 
     def lengths_s(self, due_s: float) -> list[float]:
-        """Lengths of the steps that simulate a time [s], without what remains of it: as few and as equal as can be.
+        """Lengths of the steps that simulate a time [s], without what remains of it: as few and as equal as
+        can be.
 
         They are multiples of the shortest length, so that a session has only few different ones.
         """
@@ -71,7 +76,9 @@ class Pace:
         return min(full, max(LEAST_ITERATIONS, ceil(self.levels[self.level].iterations * full)))
 
     def text(self, full: int) -> str:
-        """What the user reads where steps are longer, or have fewer iterations than the ``full`` ones that are set; else empty."""
+        """What the user reads where steps are longer, or have fewer iterations than the ``full`` ones that
+        are set; else empty.
+        """
         length_s = self._length_s(len(self.levels) - 1) if self.waits_for_input else self.length_s
         longer = f"LONGER STEPS   1/{1 / length_s:.0f} s" if self.levels[self.level].times_longer > 1 else ""
         iterations = self.iterations(full)

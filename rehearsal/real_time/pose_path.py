@@ -1,4 +1,6 @@
-"""The transducer's motion between two inputs: steps follow it continuously, though inputs come only with each picture."""
+"""The transducer's motion between two inputs: steps follow it continuously, though inputs come only with
+each picture.
+"""
 
 import numpy as np
 
@@ -13,10 +15,11 @@ ROUNDING = 1e-9
 
 
 class PosePath:
-    """The path from the present pose (4, 4) to that of the newest input. It takes as long as the input took to get there, so that the
-    speed is the input's, or a time that ``arrive_in`` sets.
+    """The path from the present pose (4, 4) to that of the newest input. It takes as long as the input took
+    to get there, so that the speed is the input's, or a time that ``arrive_in`` sets.
 
-    ``input_s`` is the time at which the input had the present pose, and ``has_news`` whether no step was made since the newest input.
+    ``input_s`` is the time at which the input had the present pose, and ``has_news`` whether no step was made
+    since the newest input.
     """
 
     def __init__(self, pose: np.ndarray, input_s: float = 0.0) -> None:

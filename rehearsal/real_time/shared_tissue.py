@@ -1,6 +1,8 @@
-"""Positions of a tissue in memory that two processes share: one writes them in turn to a few slots, the other reads the newest whole.
+"""Positions of a tissue in memory that two processes share: one writes them in turn to a few slots, the other
+reads the newest whole.
 
-Without a lock, which a process that is killed would keep: a slot is written again only SLOTS writes later, and the reader sees whether it was.
+Without a lock, which a process that is killed would keep: a slot is written again only SLOTS writes later,
+and the reader sees whether it was.
 """
 
 from multiprocessing.shared_memory import SharedMemory
@@ -12,7 +14,8 @@ SLOTS = 3
 
 
 class SharedTissue:
-    """Memory for the arrays of a tissue, of the shapes of ``like``; ``name`` is that of memory that another process has made.
+    """Memory for the arrays of a tissue, of the shapes of ``like``; ``name`` is that of memory that another
+    process has made.
 
     Each write has a number, which the writer gives: one more than the one before.
     """
@@ -40,7 +43,9 @@ class SharedTissue:
             slot[...] = array
 
     def read(self, number: int) -> list[np.ndarray] | None:
-        """Return copies of the arrays of a number that the writer has sent; None where newer ones have taken their slot."""
+        """Return copies of the arrays of a number that the writer has sent; None where newer ones have
+        taken their slot.
+        """
         arrays = [slot.copy() for slot in self._slots[number % SLOTS]]
         return None if self._begun[0] >= number + SLOTS else arrays
 

@@ -1,4 +1,6 @@
-"""What the solver's process does: it applies the commands of the other process, and between them makes the steps that the clock asks for."""
+"""What the solver's process does: it applies the commands of the other process, and between them makes the
+steps that the clock asks for.
+"""
 
 from collections import deque
 from collections.abc import Iterator
@@ -29,7 +31,9 @@ APART = "positions", "frames", "events"
 
 @dataclass(frozen=True)
 class SolverSetup:
-    """What the solver is built of, and the backend; ``pace`` chooses its steps by the clock, ``serial`` is as for ``PressedOrgan``."""
+    """What the solver is built of, and the backend; ``pace`` chooses its steps by the clock, ``serial`` is
+    as for ``PressedOrgan``.
+    """
 
     case: Case
     arch: str
@@ -39,7 +43,9 @@ class SolverSetup:
 
 @dataclass(frozen=True)
 class BuiltModel:
-    """What the window knows of the tissue model: how points are attached to it, its sizes, and whether its steps are on one core."""
+    """What the window knows of the tissue model: how points are attached to it, its sizes, and whether its
+    steps are on one core.
+    """
 
     interpolation: Interpolation
     counts: dict[str, int]
@@ -48,7 +54,8 @@ class BuiltModel:
 
 @dataclass(frozen=True)
 class Sent:
-    """A frame without what is sent apart: the number of its arrays in the shared memory, and what has changed since the one before.
+    """A frame without what is sent apart: the number of its arrays in the shared memory, and what has changed
+    since the one before.
 
     ``applied`` counts the commands that were applied.
     """
@@ -69,7 +76,8 @@ def compute(connection: Connection, parent: int) -> None:
     organ = PressedOrgan(setup.case, setup.serial)
     connection.send(BuiltModel(organ.model.carrier.interpolation, organ.model.counts(), organ.model.serial))
     at_rest = organ.settle()
-    # A step and back loads the kernels, also where the state at rest was stored. The other process is not ready yet.
+    # A step and back loads the kernels, also where the state at rest was stored. The other process is not
+    # ready yet.
     organ.advance(organ.pose)
     organ.restore(at_rest)
     timeline = Timeline(organ)
@@ -79,7 +87,9 @@ def compute(connection: Connection, parent: int) -> None:
 
 
 def _shared(connection: Connection, frame: Frame) -> SharedTissue | None:
-    """Send the first frame, and have the memory that the other process makes for the arrays of the next ones; None where it ends."""
+    """Send the first frame, and have the memory that the other process makes for the arrays of the next
+    ones; None where it ends.
+    """
     connection.send(frame)
     name = connection.recv()
     return None if name is None else SharedTissue(arrays_of(frame), name)

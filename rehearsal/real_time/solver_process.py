@@ -1,4 +1,6 @@
-"""The solver in a process of its own, which keeps pace with the clock while this process makes pictures: a ``Stepper``."""
+"""The solver in a process of its own, which keeps pace with the clock while this process makes pictures: a
+``Stepper``.
+"""
 
 from time import perf_counter
 from typing import Any
@@ -93,7 +95,8 @@ class SolverProcess:
     def _frame(self) -> Frame:
         if self._memory is None:
             raise RuntimeError("the solver has not begun")
-        # Arrays are written before the rest is sent. If newer ones have taken their place, the rest of these is on the way.
+        # Arrays are written before the rest is sent. If newer ones have taken their place, the rest of these
+        # is on the way.
         while (arrays := self._memory.read(self._write)) is None:
             self._receive_frame()
         events, self._events = tuple(self._events), []
@@ -124,6 +127,7 @@ class SolverProcess:
         process = self._started.process
         process.join(END_S)
         return SolverEnded(
-            f"the solver's process has ended (exit status {process.exitcode}), perhaps for lack of memory; what was recorded "
+            f"the solver's process has ended (exit status {process.exitcode}), perhaps for lack of memory; "
+            "what was recorded "
             "until then can be replayed: close other programs and start again"
         )

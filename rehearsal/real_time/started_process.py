@@ -50,7 +50,9 @@ def start_process() -> StartedProcess:
 
 @contextmanager
 def _without_interrupts() -> Iterator[None]:
-    """Processes that start in this context ignore Ctrl-C, which reaches them too: the one that started them ends them."""
+    """Processes that start in this context ignore Ctrl-C, which reaches them too: the one that started
+    them ends them.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -63,7 +65,9 @@ def _without_interrupts() -> Iterator[None]:
 
 @contextmanager
 def started_process(is_needed: bool) -> Iterator[StartedProcess | None]:
-    """The process of a solver, if one is needed; at the end of this context it is killed, unless ``SolverProcess`` has ended it."""
+    """The process of a solver, if one is needed; at the end of this context it is killed, unless
+    ``SolverProcess`` has ended it.
+    """
     started = start_process() if is_needed else None
     try:
         yield started

@@ -1,4 +1,6 @@
-"""Compression correction of a tracked sweep: a probe presses the same body along the tracked path, which gives each pixel's place at rest."""
+"""Compression correction of a tracked sweep: a probe presses the same body along the tracked path, which
+gives each pixel's place at rest.
+"""
 
 import numpy as np
 
@@ -8,14 +10,16 @@ from ultrasound.plane_in_tissue import PlaneInTissue
 from ultrasound.probe_manipulator import ImagePlane, advanced, image_plane, poses_between
 from ultrasound.sweep import Sweep, SweepError
 
-# The probe starts this far above its first pose, takes this time to come there, and this time for the tissue to come to rest.
+# The probe starts this far above its first pose, takes this time to come there, and this time for the tissue
+# to come to rest.
 APPROACH_MM, APPROACH_S, SETTLE_S = 30.0, 0.5, 1.0
 # A longer pause between frames is shortened to this.
 LONGEST_S = 2.0
 
 
 class CompressionCorrection:
-    """Called with the frames of a sweep in order, it returns the place of each pixel (rows, columns, 3) at rest (LPS, mm).
+    """Called with the frames of a sweep in order, it returns the place of each pixel (rows, columns, 3) at
+    rest (LPS, mm).
 
     Raises SweepError for a sweep without the probe's poses, or without square images.
     """

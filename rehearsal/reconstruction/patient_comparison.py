@@ -1,4 +1,6 @@
-"""The volumes of a sweep compared with the patient: with the surfaces of the scene, at rest in the CT, by Dice, HD95, volume, centroid."""
+"""The volumes of a sweep compared with the patient: with the surfaces of the scene, at rest in the CT, by
+Dice, HD95, volume, centroid.
+"""
 
 import math
 from dataclasses import asdict, dataclass
@@ -19,8 +21,8 @@ class SegmentationMetrics:
     """Metrics of a region found, against the true region.
 
     - ``dice``: Dice coefficient, 0 to 1.
-    - ``hd95_mm``: 95th percentile Hausdorff distance: the larger of the two directed percentiles (MONAI's definition). The
-      surface is the voxels of a region with one outside among their six neighbours.
+    - ``hd95_mm``: 95th percentile Hausdorff distance: the larger of the two directed percentiles (MONAI's
+      definition). The surface is the voxels of a region with one outside among their six neighbours.
     - ``volume_percent``: volume relative to the truth, minus 100 %.
     - ``centroid_mm``: distance of the centroids.
 
@@ -114,7 +116,9 @@ def enclosing(volumes: SweepVolumes, surface: trimesh.Trimesh) -> SweepVolumes:
 def compare_with_surfaces(
     volumes: SweepVolumes, surfaces: dict[str, trimesh.Trimesh], beads_mm: np.ndarray | None = None
 ) -> dict[str, Any]:
-    """Segmentation metrics of each region, for the whole surface and for the scanned part; landmark errors of beads (n, 3) [mm]."""
+    """Segmentation metrics of each region, for the whole surface and for the scanned part; landmark errors
+    of beads (n, 3) [mm].
+    """
     found: dict[str, Any] = {}
     for name, surface in surfaces.items():
         if name not in volumes.regions:

@@ -29,7 +29,10 @@ def save_volumes(volumes: SweepVolumes, out: Path) -> None:
 
 
 def save_volume(voxels: np.ndarray, box: VoxelBox, path: Path) -> None:
-    """Write voxels (x, y, z) on a box along the axes of LPS [mm], compressed, in the format of the suffix. Raises OSError."""
+    """Write voxels (x, y, z) on a box along the axes of LPS [mm], compressed, in the format of the suffix.
+
+    Raises OSError.
+    """
     image = sitk.GetImageFromArray(np.ascontiguousarray(voxels.transpose(2, 1, 0)))
     image.SetOrigin([float(each) for each in box.origin_mm])
     image.SetSpacing([box.spacing_mm] * 3)
@@ -37,7 +40,9 @@ def save_volume(voxels: np.ndarray, box: VoxelBox, path: Path) -> None:
 
 
 def save_slices_figure(volumes: SweepVolumes, path: Path) -> None:
-    """Write three orthogonal slices as PNG, through the centre of the tumour, or else of the scanned volume."""
+    """Write three orthogonal slices as PNG, through the centre of the tumour, or else of the scanned
+    volume.
+    """
     centred_on = volumes.regions.get("tumour", volumes.known)
     where = np.argwhere(centred_on if centred_on.any() else volumes.known)
     centre = where.mean(axis=0).round().astype(int) if len(where) else np.array(volumes.box.shape) // 2

@@ -19,7 +19,9 @@ Places = Callable[[int], np.ndarray]
 
 @dataclass(frozen=True)
 class ImagePoses:
-    """The ``frames`` (n,) of a sweep that have image and pose, and their ``matrices`` (n, 4, 4) from image to reference."""
+    """The ``frames`` (n,) of a sweep that have image and pose, and their ``matrices`` (n, 4, 4) from image
+    to reference.
+    """
 
     frames: np.ndarray
     matrices: np.ndarray
@@ -32,7 +34,9 @@ class ImagePoses:
 
 @dataclass
 class SweepVolumes:
-    """Volumes (x, y, z) on one box: grey values, ``known`` where there are any, regions by name; centroids (3,) of beads [mm] by number."""
+    """Volumes (x, y, z) on one box: grey values, ``known`` where there are any, regions by name; centroids
+    (3,) of beads [mm] by number.
+    """
 
     box: VoxelBox
     grey: np.ndarray
@@ -79,10 +83,12 @@ def reconstruct_volumes(
 ) -> SweepVolumes:
     """Reconstruct volumes from the images of a sweep.
 
-    ``labels`` are the same frames with ``PixelLabel`` values. ``places`` is called with the frames in order; without it the pixels are where
-    the tracked poses place them. Without grey values there must be labels. ``progress`` shows the progress over frames and volumes.
+    ``labels`` are the same frames with ``PixelLabel`` values. ``places`` is called with the frames in order;
+    without it the pixels are where the tracked poses place them. Without grey values there must be labels.
+    ``progress`` shows the progress over frames and volumes.
 
-    Raises SweepError where labels and images do not match or the images are no volume, ValueError as ``VoxelBox.around``.
+    Raises SweepError where labels and images do not match or the images are no volume, ValueError as
+    ``VoxelBox.around``.
     """
     if labels is not None and labels.images.shape != sweep.images.shape:
         raise SweepError(
@@ -128,7 +134,8 @@ def _check_thickness(corners: np.ndarray, spacing_mm: float) -> None:
     thickness = float(np.ptp(centred @ across))
     if thickness < spacing_mm:
         raise SweepError(
-            f"the images are in one plane: together they are {thickness:.2f} mm thick, less than a voxel of {spacing_mm:g} mm; expected two "
+            f"the images are in one plane: together they are {thickness:.2f} mm thick, less than a voxel of "
+            f"{spacing_mm:g} mm; expected two "
             "images or more at different positions"
         )
 
@@ -144,7 +151,9 @@ def _channels(labels: Sweep | None) -> dict[str, Callable[[np.ndarray], np.ndarr
 
 
 class _Beads:
-    """Centroids of the pixels of each bead; a bead that the edge of the image or an end of the sweep cuts has none."""
+    """Centroids of the pixels of each bead; a bead that the edge of the image or an end of the sweep cuts
+    has none.
+    """
 
     def __init__(self, mask: np.ndarray) -> None:
         self._edge = ~binary_erosion(mask)
@@ -152,7 +161,9 @@ class _Beads:
         self._cut: set[int] = set()
 
     def add(self, labels: np.ndarray, matrix: np.ndarray, at: np.ndarray | None, is_end: bool) -> None:
-        """Add a label image (rows, columns), with its pose, or the places of its pixels (rows, columns, 3) [mm]."""
+        """Add a label image (rows, columns), with its pose, or the places of its pixels (rows, columns, 3)
+        [mm].
+        """
         rows, columns = np.nonzero(labels >= PixelLabel.BEAD)
         if at is not None:
             places = at[rows, columns]

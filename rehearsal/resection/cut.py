@@ -6,9 +6,10 @@ The resection surface is the lower side of a convex hull, of the line and of wha
 - enucleoresection: the tumour and a margin;
 - wedge: straight walls that meet below the tumour and the margin, in a ridge along the line's longest extent.
 
-The cut never extends beyond the line, seen along the line's direction, but for what the line encloses and bulges over it: all of
-a tumour that protrudes from the kidney comes with the specimen. Techniques: Minervini et al. 2014, "Standardized reporting of
-resection technique during nephron-sparing surgery: the Surface-Intermediate-Base margin score" (Eur. Urol. 66:803).
+The cut never extends beyond the line, seen along the line's direction, but for what the line encloses and
+bulges over it: all of a tumour that protrudes from the kidney comes with the specimen. Techniques: Minervini
+et al. 2014, "Standardized reporting of resection technique during nephron-sparing surgery: the
+Surface-Intermediate-Base margin score" (Eur. Urol. 66:803).
 """
 
 from collections.abc import Iterable
@@ -51,8 +52,9 @@ STEEPEST = 3.0
 
 @checked_dataclass(frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
 class CutSettings:
-    """How the surgeon cuts: by which technique, with which margin [mm] around the tumour, or to a depth [mm] below the line where one is
-    given; ``filling`` is what the crater then contains. Raises ValueError for a value out of range.
+    """How the surgeon cuts: by which technique, with which margin [mm] around the tumour, or to a depth [mm]
+    below the line where one is given; ``filling`` is what the crater then contains. Raises ValueError for a
+    value out of range.
     """
 
     technique: Technique = "enucleoresection"
@@ -84,7 +86,10 @@ class Cut:
 def cut_organ(
     organ: trimesh.Trimesh, line: ScoreLine, settings: CutSettings, tumour_points: np.ndarray
 ) -> Cut:
-    """Cut an organ along a line around points (n, 3) [mm] of the tumour's surface as far as it was seen. Raises ResectionError."""
+    """Cut an organ along a line around points (n, 3) [mm] of the tumour's surface as far as it was seen.
+
+    Raises ResectionError.
+    """
     whole = solid_of(organ, "organ").as_original()
     cutter = _cutter(organ, line, settings, tumour_points).as_original()
     inner, outer = whole ^ cutter, whole - cutter
@@ -98,7 +103,8 @@ def cut_organ(
     # A flat piece, which rounding leaves, would also be a flat slit in the remnant.
     remnant, *separated = _pieces(outer if len(inner.decompose()) == 1 else whole - specimen)
     if separated:
-        # What the cut separates from the organ elsewhere, such as the rim of a tumour on a stalk, comes with the specimen.
+        # What the cut separates from the organ elsewhere, such as the rim of a tumour on a stalk, comes with
+        # the specimen.
         specimen = _pieces(whole - remnant)[0]
     _check_size(specimen.volume(), organ.volume)
     own, of_own = surface_of(specimen)
@@ -108,7 +114,9 @@ def cut_organ(
 
 
 def hilum_of(attachment: Attachment, origin: np.ndarray) -> trimesh.Trimesh | None:
-    """The ball that a scene's attachment holds, relative to an origin (3,) [mm, LPS]; None where it holds nothing."""
+    """The ball that a scene's attachment holds, relative to an origin (3,) [mm, LPS]; None where it holds
+    nothing.
+    """
     if attachment.at_mm is None or attachment.radius_mm == 0:
         return None
     return translated(
@@ -124,13 +132,17 @@ def check_hilum(cut: Cut, organ: trimesh.Trimesh, hilum: trimesh.Trimesh | None)
     removed, whole = ((solid_of(each, "organ") ^ around).volume() for each in (cut.specimen, organ))
     if removed > MOST_OF_HILUM * whole:
         raise ResectionError(
-            f"the cut removes {removed / whole:.0%} of the tissue around the hilum, where the kidney's vessels enter; set the score "
+            f"the cut removes {removed / whole:.0%} of the tissue around the hilum, where the kidney's "
+            "vessels enter; set the score "
             "nearer to the tumour"
         )
 
 
 def _pieces(solid: manifold3d.Manifold) -> list[manifold3d.Manifold]:
-    """The separate pieces of a solid, the largest first. Rounding of a Boolean operation leaves flat ones, which are none."""
+    """The separate pieces of a solid, the largest first.
+
+    Rounding of a Boolean operation leaves flat ones, which are none.
+    """
     pieces = [piece for piece in solid.decompose() if piece.volume() > LEAST_PIECE_MM3]
     return sorted(pieces, key=lambda piece: -piece.volume())
 
@@ -145,11 +157,13 @@ def _check_size(volume_mm3: float, organ_mm3: float) -> None:
     """Raises ResectionError for a specimen that is next to nothing, or most of the organ."""
     if volume_mm3 < 1000 * LEAST_SPECIMEN_ML:
         raise ResectionError(
-            f"the cut removes only {volume_mm3 / 1000:.2f} ml; set the score farther around the tumour, or cut deeper"
+            f"the cut removes only {volume_mm3 / 1000:.2f} ml; set the score farther around the tumour, or "
+            "cut deeper"
         )
     if volume_mm3 > MOST_OF_ORGAN * organ_mm3:
         raise ResectionError(
-            f"the cut removes {volume_mm3 / organ_mm3:.0%} of the organ, expected at most {MOST_OF_ORGAN:.0%}: a partial nephrectomy "
+            f"the cut removes {volume_mm3 / organ_mm3:.0%} of the organ, expected at most "
+            f"{MOST_OF_ORGAN:.0%}: a partial nephrectomy "
             "leaves most of it; set the score nearer to the tumour"
         )
 
@@ -177,7 +191,9 @@ def _cutter(
 
 
 def _bulge(enclosed: np.ndarray, outline: manifold3d.CrossSection) -> np.ndarray:
-    """The triangles (n, 3, 3) of a surface that are beyond the line's outline by more than BESIDE_MM, along the axes of the line."""
+    """The triangles (n, 3, 3) of a surface that are beyond the line's outline by more than BESIDE_MM,
+    along the axes of the line.
+    """
     around = outline.offset(BESIDE_MM, manifold3d.JoinType.Round).to_polygons()[0]
     seen = points_in_poly(enclosed[:, :, :2].reshape(-1, 2), around)
     return enclosed[~seen.reshape(-1, 3).all(axis=1)]
@@ -190,10 +206,14 @@ def _outline(polygons: Iterable[np.ndarray]) -> manifold3d.CrossSection:
 
 
 def _below(rim: np.ndarray, settings: CutSettings, tumour: np.ndarray) -> np.ndarray:
-    """Points (n, 3) under the rim (k, 3) that the resection surface goes around, along the axes of the line. Raises ResectionError."""
+    """Points (n, 3) under the rim (k, 3) that the resection surface goes around, along the axes of the line.
+
+    Raises ResectionError.
+    """
     if settings.depth_mm is None and len(tumour) == 0:
         raise ResectionError(
-            "no part of the tumour was seen in the image, so that the depth of the cut is not known; sweep the probe over the tumour "
+            "no part of the tumour was seen in the image, so that the depth of the cut is not known; sweep "
+            "the probe over the tumour "
             "first, or set a depth"
         )
     is_wedge = settings.technique == "wedge"
@@ -207,7 +227,9 @@ def _below(rim: np.ndarray, settings: CutSettings, tumour: np.ndarray) -> np.nda
 
 
 def grown(points: np.ndarray, by_mm: float) -> np.ndarray:
-    """Points whose convex hull contains all balls of a radius [mm] around points (n, 3), by 5 % of it more at most."""
+    """Points whose convex hull contains all balls of a radius [mm] around points (n, 3), by 5 % of it more
+    at most.
+    """
     if by_mm == 0:
         return points
     ball = trimesh.creation.icosphere(subdivisions=2)
@@ -225,11 +247,14 @@ def _ridge(rim: np.ndarray, height: float) -> np.ndarray:
 
 
 def _ridge_height(rim: np.ndarray, around: np.ndarray) -> float:
-    """The height of the ridge at which straight walls from the rim contain points (n, 3), as far as the rim is wide enough."""
+    """The height of the ridge at which straight walls from the rim contain points (n, 3), as far as the
+    rim is wide enough.
+    """
     half = np.ptp(rim[:, :2], axis=0) / 2
     centre = rim[:, :2].min(axis=0) + half
     length = max(half[0] - half[1], 0.0)
-    # Distance from the axis of the ridge, as a share of the rim's: at a depth d walls are at 1 - d / depth of it.
+    # Distance from the axis of the ridge, as a share of the rim's: at a depth d walls are at 1 - d / depth of
+    # it.
     along = np.abs(around[:, 0] - centre[0])
     aside = np.hypot(np.maximum(along - length, 0.0), around[:, 1] - centre[1]) / max(half[1], 1e-6)
     depth = np.maximum(-around[:, 2], 0.0)
@@ -245,9 +270,11 @@ def faces_of(surface: trimesh.Trimesh, chosen: np.ndarray) -> trimesh.Trimesh:
 
 
 def part_left(part: trimesh.Trimesh, cut: Cut | None, is_within: bool = False) -> trimesh.Trimesh | None:
-    """The surface of what a cut leaves of a part of the organ; None where next to nothing is left. Raises PatientError.
+    """The surface of what a cut leaves of a part of the organ; None where next to nothing is left. Raises
+    PatientError.
 
-    What is outside of the organ stays, as of vessels at the hilum; for a part ``is_within`` the organ, that is the error of its surface.
+    What is outside of the organ stays, as of vessels at the hilum; for a part ``is_within`` the organ, that
+    is the error of its surface.
     """
     if cut is None:
         return part

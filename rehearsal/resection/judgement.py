@@ -1,7 +1,8 @@
 """The figures of a cut that pathologist and surgeon ask for: margin, what was removed, and what was opened.
 
-Margins are those of the Surface-Intermediate-Base score (Minervini et al. 2014) as distances: from each place of the resection surface to
-the nearest point of the tumour; 0 where the cut is in the tumour (positive margin).
+Margins are those of the Surface-Intermediate-Base score (Minervini et al. 2014) as distances: from each place
+of the resection surface to the nearest point of the tumour; 0 where the cut is in the tumour (positive
+margin).
 """
 
 from collections.abc import Mapping
@@ -44,7 +45,9 @@ class DividedVessel:
 
 @dataclass(frozen=True)
 class MarginMap:
-    """Faces of the resection surface: middles (f, 3) [mm], areas (f,) [mm^2], and signed distances (f,) [mm] from the tumour."""
+    """Faces of the resection surface: middles (f, 3) [mm], areas (f,) [mm^2], and signed distances (f,)
+    [mm] from the tumour.
+    """
 
     middle: np.ndarray
     area_mm2: np.ndarray
@@ -57,7 +60,9 @@ class MarginMap:
 
     @property
     def least_mm(self) -> float:
-        """Least margin [mm], rounded as the report has it: the same in all places that show it with one digit."""
+        """Least margin [mm], rounded as the report has it: the same in all places that show it with one
+        digit.
+        """
         return round(float(self.margin_mm.min()), 2)
 
     @property
@@ -77,9 +82,11 @@ class MarginMap:
 
 @dataclass(frozen=True)
 class Judgement:
-    """The figures of a cut. ``margin`` in the undeformed patient, ``margin_as_cut`` in the tissue as it was when it was cut.
+    """The figures of a cut. ``margin`` in the undeformed patient, ``margin_as_cut`` in the tissue as it was
+    when it was cut.
 
-    The collecting system and the vessels are None where the patient has none labelled. ``volume_change_percent`` is that of organ and specimen together, in the tissue as cut.
+    The collecting system and the vessels are None where the patient has none labelled.
+    ``volume_change_percent`` is that of organ and specimen together, in the tissue as cut.
     """
 
     margin: MarginMap
@@ -97,12 +104,14 @@ class Judgement:
         found = []
         if self.margin.positive_mm2 > 0:
             found.append(
-                f"the cut goes through the tumour over {shown(self.margin.positive_mm2, 'mm2')}; {shown(self.tumour_left_ml, 'ml', 1)} of it left"
+                f"the cut goes through the tumour over {shown(self.margin.positive_mm2, 'mm2')}; "
+                f"{shown(self.tumour_left_ml, 'ml', 1)} of it left"
             )
         wide = [vessel for vessel in self.vessels or () if vessel.diameter_mm >= MAIN_VESSEL_MM]
         if wide:
             found.append(
-                f"the cut divides a {wide[0].tissue} of {wide[0].diameter_mm:.1f} mm, as wide as a main vessel"
+                f"the cut divides a {wide[0].tissue} of {wide[0].diameter_mm:.1f} mm, as wide as a main "
+                "vessel"
             )
         return found
 
@@ -151,7 +160,8 @@ def judge(
     labels: Grid | None = None,
     tissues: Mapping[int, str] | None = None,
 ) -> Judgement:
-    """Judge a cut of an organ with a tumour and further parts, by tissue, all at rest [mm]; ``labels`` name the vessels.
+    """Judge a cut of an organ with a tumour and further parts, by tissue, all at rest [mm]; ``labels`` name
+    the vessels.
 
     Raises PatientError for a part whose surface is no closed one.
     """
@@ -216,7 +226,9 @@ def divided_vessels(
     labels: Grid | None,
     tissues: Mapping[int, str],
 ) -> tuple[DividedVessel, ...] | None:
-    """The vessels that a surface of small faces divides, if there are any, the widest first; by ``labels`` they are arteries or veins."""
+    """The vessels that a surface of small faces divides, if there are any, the widest first; by ``labels``
+    they are arteries or veins.
+    """
     if vessels is None:
         return None
     middle, area = surface.triangles_center, surface.area_faces
@@ -236,13 +248,15 @@ def divided_vessels(
 
 
 def diameter_of_section(middle: np.ndarray, area_mm2: np.ndarray) -> float:
-    """Diameter [mm] of a round vessel from its section: the short axis of the ellipse with the section's second moments.
+    """Diameter [mm] of a round vessel from its section: the short axis of the ellipse with the section's
+    second moments.
 
     ``middle`` (f, 3) [mm] and ``area_mm2`` (f,) are its faces.
     """
     about = middle - area_mm2 @ middle / area_mm2.sum()
     moments = np.linalg.eigvalsh((about * area_mm2[:, None]).T @ about / area_mm2.sum())
-    # Of an ellipse with the half axes a and b they are a^2 / 4 and b^2 / 4; across its plane the moment is the least.
+    # Of an ellipse with the half axes a and b they are a^2 / 4 and b^2 / 4; across its plane the moment is
+    # the least.
     return float(4 * np.sqrt(max(moments[1], 0.0)))
 
 
@@ -258,7 +272,9 @@ def _vessel_at(points: np.ndarray, labels: Grid | None, tissues: Mapping[int, st
 
 
 def drawn_mm(distance_mm: np.ndarray) -> np.ndarray:
-    """Distances (n,) [mm] from the tumour as a picture has them: 0 where the cut runs along its surface, which is no positive margin."""
+    """Distances (n,) [mm] from the tumour as a picture has them: 0 where the cut runs along its surface,
+    which is no positive margin.
+    """
     return np.where((distance_mm < 0) & (distance_mm >= -SURFACE_ERROR_MM), 0.0, distance_mm)
 
 
@@ -275,7 +291,8 @@ def findings_of(judgement: Judgement) -> dict[str, str]:
         "least margin": f"{margin.least_mm:.1f} mm",
         "positive margin": shown(margin.positive_mm2, "mm2"),
         "specimen": f"{judgement.specimen_ml:.1f} ml",
-        "parenchyma": f"-{judgement.parenchyma_removed_ml:.1f} ml ({judgement.parenchyma_removed_percent:.1f} %)",
+        "parenchyma": f"-{judgement.parenchyma_removed_ml:.1f} ml "
+        f"({judgement.parenchyma_removed_percent:.1f} %)",
         "calyces opened": NOT_LABELLED if opened is None else f"{opened:.0f} mm2",
     }
     if judgement.vessels is None:

@@ -1,4 +1,6 @@
-"""The surgeon's actions of a resection: where marks of the score are on the capsule, and what a cut is given."""
+"""The surgeon's actions of a resection: where marks of the score are on the capsule, and what a cut is
+given.
+"""
 
 import base64
 from collections.abc import Callable
@@ -31,7 +33,9 @@ def cut_command(anatomy: DeformedAnatomy, settings: CutSettings, is_seen: IsSeen
 
 
 def seen_share(anatomy: DeformedAnatomy) -> float:
-    """The share of the tumour's surface that the images had shown when it was cut; 1 without a cut or a tumour."""
+    """The share of the tumour's surface that the images had shown when it was cut; 1 without a cut or a
+    tumour.
+    """
     request, tumour = anatomy.frame.resection.cut, anatomy.case.tumour
     if request is None or tumour is None:
         return 1.0
@@ -39,12 +43,17 @@ def seen_share(anatomy: DeformedAnatomy) -> float:
 
 
 def places_at_rest(case: Case, points: np.ndarray) -> np.ndarray:
-    """Places (n, 3) of the organ's surface at rest that are nearest to points (n, 3) of the patient (LPS, mm)."""
+    """Places (n, 3) of the organ's surface at rest that are nearest to points (n, 3) of the patient (LPS,
+    mm).
+    """
     return places_on(case.organ, points - case.origin)[0]
 
 
 def mark_under(anatomy: DeformedAnatomy, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """The place (1, 3) at rest [mm] of the organ's surface where a ray first meets it. Raises ResectionError where it does not."""
+    """The place (1, 3) at rest [mm] of the organ's surface where a ray first meets it.
+
+    Raises ResectionError where it does not.
+    """
     now, faces = _surface_now(anatomy)
     hits = igl.ray_mesh_intersect(origin.astype(float), direction.astype(float), now, faces)
     if len(hits) == 0:
@@ -53,10 +62,11 @@ def mark_under(anatomy: DeformedAnatomy, origin: np.ndarray, direction: np.ndarr
 
 
 def marks_of_image(anatomy: DeformedAnatomy, margin_mm: float) -> np.ndarray:
-    """The places (1 or 2, 3) at rest [mm] of the organ's surface in the image plane, a margin beside the lateral edges of the tumour that the
-    image shows.
+    """The places (1 or 2, 3) at rest [mm] of the organ's surface in the image plane, a margin beside the
+    lateral edges of the tumour that the image shows.
 
-    It is the place nearest to the probe. Raises ResectionError where the image shows no edge, or the organ ends before the place.
+    It is the place nearest to the probe. Raises ResectionError where the image shows no edge, or the organ
+    ends before the place.
     """
     outline = anatomy.tumour_outline()
     plane = anatomy.image_plane()
@@ -75,7 +85,10 @@ def marks_of_image(anatomy: DeformedAnatomy, margin_mm: float) -> np.ndarray:
 
 
 def _nearest_to_probe(section: np.ndarray, across_mm: float) -> tuple[float, float]:
-    """The place (u, v) of a section (n, 2, 2) [mm] at a lateral position that is nearest to the probe. Raises ResectionError."""
+    """The place (u, v) of a section (n, 2, 2) [mm] at a lateral position that is nearest to the probe.
+
+    Raises ResectionError.
+    """
     start, end = section[:, 0], section[:, 1]
     crossing = (start[:, 0] <= across_mm) != (end[:, 0] <= across_mm)
     if not crossing.any():
@@ -101,8 +114,8 @@ def _surface_now(anatomy: DeformedAnatomy) -> tuple[np.ndarray, np.ndarray]:
 
 
 def distance_to_tumour(line: ScoreLine | None, tumour: trimesh.Trimesh | None) -> np.ndarray:
-    """Distance (k,) [mm] of each point of a score at rest from the outline of a tumour, both seen along the score's direction; negative over the
-    tumour. Empty without a score or a tumour.
+    """Distance (k,) [mm] of each point of a score at rest from the outline of a tumour, both seen along the
+    score's direction; negative over the tumour. Empty without a score or a tumour.
     """
     if line is None or tumour is None:
         return np.zeros(0)

@@ -1,4 +1,6 @@
-"""Proposals of a resection: lines on the capsule around tumour and margin, and what a cut along each would take."""
+"""Proposals of a resection: lines on the capsule around tumour and margin, and what a cut along each would
+take.
+"""
 
 import contextlib
 from collections.abc import Mapping
@@ -19,17 +21,21 @@ MARKS = 16
 SLACK_MM = 0.5
 # The walls of a wedge are oblique: its line is this much wider.
 WEDGE_WIDER_MM = 4.0
-# A line's direction is found in so many turns at most, to the first cosine; lines below the second are different.
+# A line's direction is found in so many turns at most, to the first cosine; lines below the second are
+# different.
 MOST_TURNS, SAME_DIRECTION, DIFFERENT_DIRECTION = 10, 0.9999, 0.99
-# Weights, chosen by us: 100 mm2 of opened collecting system, or a vessel of 3 mm, count as 1 ml of parenchyma, a missing millimetre of margin
-# as 5 ml, and 1 cm2 of tumour left as 50 ml. A margin counts as kept within the last value.
+# Weights, chosen by us: 100 mm2 of opened collecting system, or a vessel of 3 mm, count as 1 ml of
+# parenchyma, a missing millimetre of margin as 5 ml, and 1 cm2 of tumour left as 50 ml. A margin counts as
+# kept within the last value.
 OPENED_ML_MM2, VESSEL_ML_MM2, MISSING_ML_MM, LEFT_ML_MM2, KEPT_WITHIN_MM = 0.01, 0.14, 5.0, 0.5, 0.1
 
 
 def marks_around(
     organ: trimesh.Trimesh, tumour: trimesh.Trimesh, margin_mm: float, direction: np.ndarray
 ) -> np.ndarray:
-    """Marks (n, 3) [mm] on an organ's surface around a tumour and a margin, seen along a direction (3,) out of the organ."""
+    """Marks (n, 3) [mm] on an organ's surface around a tumour and a margin, seen along a direction (3,)
+    out of the organ.
+    """
     axes = np.vstack([np.linalg.svd(direction[None])[2][1:], direction])
     points = grown(np.asarray(tumour.vertices), margin_mm + SLACK_MM) @ axes.T
     outline = ConvexHull(points[:, :2])
@@ -58,7 +64,9 @@ def marks_around(
 
 
 def _beyond(organ: trimesh.Trimesh, tumour: trimesh.Trimesh, margin_mm: float) -> np.ndarray:
-    """The vertices (n, 3) of an organ that are farther from a tumour than a margin [mm]; all where none is."""
+    """The vertices (n, 3) of an organ that are farther from a tumour than a margin [mm]; all where none
+    is.
+    """
     vertices = np.asarray(organ.vertices, float)
     beyond = vertices[np.linalg.norm(places_on(tumour, vertices)[0] - vertices, axis=1) > margin_mm]
     return beyond if len(beyond) else vertices
@@ -67,7 +75,10 @@ def _beyond(organ: trimesh.Trimesh, tumour: trimesh.Trimesh, margin_mm: float) -
 def line_around(
     organ: trimesh.Trimesh, tumour: trimesh.Trimesh, margin_mm: float, direction: np.ndarray
 ) -> ScoreLine:
-    """The line around a tumour and a margin, seen along its own direction, which is found from another (3,). Raises ResectionError."""
+    """The line around a tumour and a margin, seen along its own direction, which is found from another (3,).
+
+    Raises ResectionError.
+    """
     for _ in range(MOST_TURNS):
         line = score_line(organ, marks_around(organ, tumour, margin_mm, direction))
         turned, direction = line.direction @ direction, line.direction
@@ -95,7 +106,9 @@ class Proposal:
 
 
 def cost_terms(judgement: Judgement, margin_mm: float) -> dict[str, float]:
-    """Parenchyma removed [ml], and what counts as so many ml more: an opened collecting system, divided vessels, missing and positive margin."""
+    """Parenchyma removed [ml], and what counts as so many ml more: an opened collecting system, divided
+    vessels, missing and positive margin.
+    """
     missing = max(margin_mm - float(judgement.margin.margin_mm.min()) - KEPT_WITHIN_MM, 0.0)
     return {
         "parenchyma": judgement.parenchyma_removed_ml,
@@ -124,7 +137,8 @@ def why_first(proposals: list[Proposal]) -> str:
         if f"{a:.1f}" != f"{b:.1f}"
     ]
     return (
-        f"The first, {first.settings.technique}, costs {second.cost_ml - first.cost_ml:.1f} points less than the next"
+        f"The first, {first.settings.technique}, costs {second.cost_ml - first.cost_ml:.1f} points less "
+        "than the next"
         f"{': ' * bool(differing)}{', '.join(differing)}."
     )
 
@@ -138,9 +152,11 @@ def propose(
     tissues: Mapping[int, str] | None = None,
     hilum: trimesh.Trimesh | None = None,
 ) -> list[Proposal]:
-    """Cuts of an organ at rest around its tumour with a margin [mm], the best first: at most one for each technique and direction.
+    """Cuts of an organ at rest around its tumour with a margin [mm], the best first: at most one for each
+    technique and direction.
 
-    A cut that removes much of the tissue within ``hilum`` is none. Raises ResectionError where none can be made.
+    A cut that removes much of the tissue within ``hilum`` is none. Raises ResectionError where none can be
+    made.
     """
     settings = [CutSettings("enucleoresection", margin_mm), CutSettings("wedge", margin_mm)]
     if margin_mm == 0:
@@ -162,13 +178,16 @@ def propose(
             found.append(Proposal(cut, judged))
     if not found:
         raise ResectionError(
-            f"no cut with a margin of {margin_mm:g} mm around this tumour leaves most of the kidney and of its hilum; choose a smaller margin"
+            f"no cut with a margin of {margin_mm:g} mm around this tumour leaves most of the kidney and of "
+            "its hilum; choose a smaller margin"
         )
     return sorted(found, key=lambda proposal: proposal.cost_ml)
 
 
 def _lines(organ: trimesh.Trimesh, tumour: trimesh.Trimesh, margin_mm: float) -> list[ScoreLine]:
-    """Different lines around a tumour, found from directions on all sides of the organ that are near to it."""
+    """Different lines around a tumour, found from directions on all sides of the organ that are near to
+    it.
+    """
     outward = places_on(organ, tumour.center_mass[None])[1][0]
     starts = [outward, *(each for each in trimesh.creation.icosahedron().vertices if each @ outward > 0)]
     lines: list[ScoreLine] = []

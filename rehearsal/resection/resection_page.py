@@ -31,7 +31,8 @@ NOTHING_CUT = "nothing was cut, or there is no tumour to judge by"
 # Colours of the margin: in the tumour, then up to each limit, then beyond the last.
 COLOURS = ("#7a0016", "#e5383b", "#ef8a00", "#ffd60a", "#52b483")
 CAPSULE = "#d1caca"
-# Views of the specimen along the axes of the score's frame: title, direction from which it is seen, and what is up.
+# Views of the specimen along the axes of the score's frame: title, direction from which it is seen, and what
+# is up.
 VIEWS = (
     ("specimen from below: resection surface", (0, 0, -1), (0, 1, 0)),
     ("specimen from the side", (0, -1, 0), (0, 0, 1)),
@@ -44,7 +45,9 @@ LIGHT = np.array([0.4, 0.6, 0.7])
 def figures_of(
     cut: Cut, judgement: Judgement, tumour: trimesh.Trimesh, seen_percent: float | None = None
 ) -> dict[str, Any]:
-    """The figures of a cut, and how it was made; ``seen_percent`` of the tumour's surface was seen, None where no image was."""
+    """The figures of a cut, and how it was made; ``seen_percent`` of the tumour's surface was seen, None
+    where no image was.
+    """
     asked = cut.settings
     return dict(
         technique=asked.technique,
@@ -58,7 +61,10 @@ def figures_of(
 
 
 def report_of(anatomy: DeformedAnatomy, plan: ResectionPlan | None = None) -> dict[str, Any]:
-    """The figures of a cut, how it was made, and its comparison with a plan, for ``report.json``. Raises ResectionError without a cut."""
+    """The figures of a cut, how it was made, and its comparison with a plan, for ``report.json``.
+
+    Raises ResectionError without a cut.
+    """
     cut, judgement, tumour = anatomy.cut, anatomy.judgement, anatomy.case.tumour
     if cut is None or judgement is None or tumour is None:
         raise ResectionError(NOTHING_CUT)
@@ -68,7 +74,10 @@ def report_of(anatomy: DeformedAnatomy, plan: ResectionPlan | None = None) -> di
 
 
 def save_page(anatomy: DeformedAnatomy, report: dict[str, Any], out: Path) -> list[Path]:
-    """Write ``resection.png`` and ``resection.json`` with a report into a folder; return them. Raises ResectionError, OSError."""
+    """Write ``resection.png`` and ``resection.json`` with a report into a folder; return them.
+
+    Raises ResectionError, OSError.
+    """
     cut, judgement, tumour = anatomy.cut, anatomy.judgement, anatomy.case.tumour
     if cut is None or judgement is None or tumour is None:
         raise ResectionError(NOTHING_CUT)
@@ -133,7 +142,9 @@ def _draw_specimen(axes: Any, faces: np.ndarray, colours: np.ndarray, title: str
 
 
 def _draw_compass(axes: Axes, seen: np.ndarray) -> None:
-    """Draw the patient's axes by their letters, for a view's axes right, up, towards the eye (3, 3); ends towards the eye are dark."""
+    """Draw the patient's axes by their letters, for a view's axes right, up, towards the eye (3, 3); ends
+    towards the eye are dark.
+    """
     ends = ends_of(seen * [[1], [1], [-1]])
     places = np.array([end * (1 + 0.35 / np.linalg.norm(end)) for _, end in ends])
     for rank, shows_letter in enumerate(are_apart(places, LETTER)):
@@ -225,7 +236,8 @@ def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
         *([] if seen is None else [("tumour surface seen", f"{seen:.0f} %")]),
         (
             "margin",
-            f"{report['margin_min_mm']:.1f} mm least, {report['margin_mean_mm']:.1f} mm mean; asked {report['margin_asked_mm']:g}",
+            f"{report['margin_min_mm']:.1f} mm least, {report['margin_mean_mm']:.1f} mm mean; asked "
+            f"{report['margin_asked_mm']:g}",
         ),
         *why_less(report),
         (
@@ -235,12 +247,14 @@ def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
         (f"area below {limits} mm", f"{below} mm2"),
         (
             "positive margin",
-            f"{shown(report['positive_margin_mm2'], 'mm2')}; tumour left {shown(report['tumour_left_ml'], 'ml', 2)}",
+            f"{shown(report['positive_margin_mm2'], 'mm2')}; tumour left "
+            f"{shown(report['tumour_left_ml'], 'ml', 2)}",
         ),
         ("specimen", f"{report['specimen_ml']:.1f} ml"),
         (
             "parenchyma removed",
-            f"{report['parenchyma_removed_ml']:.1f} ml, {report['parenchyma_removed_percent']:.1f} % of the kidney",
+            f"{report['parenchyma_removed_ml']:.1f} ml, {report['parenchyma_removed_percent']:.1f} % of the "
+            "kidney",
         ),
         ("collecting system", NOT_LABELLED if opened is None else f"{opened:.0f} mm2 opened"),
         ("vessels cut", NOT_LABELLED if divided is None else cut_vessels or "none"),

@@ -1,4 +1,7 @@
-"""The file of a planned resection: proposals, the best first, with their figures. JSON; patient coordinates LPS, mm."""
+"""The file of a planned resection: proposals, the best first, with their figures.
+
+JSON; patient coordinates LPS, mm.
+"""
 
 import json
 from pathlib import Path
@@ -47,7 +50,9 @@ class _FileModel(BaseModel):
 
 
 class PlannedCut(_FileModel):
-    """A technique and a closed line on the capsule at rest; ``cost_ml`` see ``proposal.cost_ml``, ``figures`` those of ``Judgement.report``."""
+    """A technique and a closed line on the capsule at rest; ``cost_ml`` see ``proposal.cost_ml``,
+    ``figures`` those of ``Judgement.report``.
+    """
 
     technique: Technique
     cost_ml: float
@@ -85,7 +90,9 @@ class ResectionPlan(_FileModel):
         return self.cuts[0]
 
     def compared(self, judgement: Judgement) -> dict[str, Any]:
-        """A rehearsed cut against the best planned one: what both cost, and how much more the rehearsed one took away."""
+        """A rehearsed cut against the best planned one: what both cost, and how much more the rehearsed
+        one took away.
+        """
         planned, figures, made = self.best, self.best.figures, judgement.report()
         return dict(
             planned_technique=planned.technique,
@@ -96,13 +103,18 @@ class ResectionPlan(_FileModel):
 
 
 def against_plan(compared: dict[str, Any]) -> str:
-    """What ``ResectionPlan.compared`` found, in words: both costs, and in which figures the cut differs from the planned one."""
+    """What ``ResectionPlan.compared`` found, in words: both costs, and in which figures the cut differs
+    from the planned one.
+    """
     differing = [
         f"{word} {more:+.1f} {unit}"
         for name, (word, unit) in COMPARED.items()
         if abs(more := compared[f"{name}_more"] or 0.0) >= LEAST_SHOWN
     ]
-    costs = f"cost {compared['cost_ml']:.1f} points, planned {compared['planned_cost_ml']:.1f} by {compared['planned_technique']}"
+    costs = (
+        f"cost {compared['cost_ml']:.1f} points, planned {compared['planned_cost_ml']:.1f} by "
+        f"{compared['planned_technique']}"
+    )
     return f"{costs}: {', '.join(differing)}" if differing else costs
 
 
@@ -152,5 +164,6 @@ def read_resection_plan(path: Path) -> ResectionPlan:
         raise ResectionPlanError(f"{path}: cannot be read as a plan of a resection ({error})") from None
     except ValidationError as error:
         raise ResectionPlanError(
-            f"{path}: not a plan of a resection of this version ({explained(error)}); expected a file that app.py plan --resect wrote"
+            f"{path}: not a plan of a resection of this version ({explained(error)}); expected a file that "
+            "app.py plan --resect wrote"
         ) from None

@@ -1,4 +1,7 @@
-"""What was done of a resection: the marks of the score, and the cut. Values alone, so that undo, sessions and replays can keep them."""
+"""What was done of a resection: the marks of the score, and the cut.
+
+Values alone, so that undo, sessions and replays can keep them.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,8 +17,8 @@ MOST_MARKS = 200
 
 @dataclass(frozen=True)
 class CutRequest:
-    """A cut: how the surgeon cut, which vertices of the tumour's surface the image had shown (bits, packed), and the positions of the tissue's
-    nodes when it was cut (n, 3) [mm], float32 bytes.
+    """A cut: how the surgeon cut, which vertices of the tumour's surface the image had shown (bits, packed),
+    and the positions of the tissue's nodes when it was cut (n, 3) [mm], float32 bytes.
     """
 
     settings: CutSettings

@@ -1,4 +1,6 @@
-"""What the window shows of a resection: the score, the resection surface that a cut would have now, and their figures."""
+"""What the window shows of a resection: the score, the resection surface that a cut would have now, and
+their figures.
+"""
 
 import numpy as np
 
@@ -34,9 +36,9 @@ def cut_settings(settings: Settings) -> CutSettings:
 class ResectionView:
     """The score and the coming resection surface of an anatomy.
 
-    ``plan`` is what is to be followed, if anything. ``line`` is the score's, ``fault`` says why a cut is not possible now; ``tumour_mm``
-    (k,) are the distances of the line's points from the tumour's outline, ``seen_share`` is the share of the tumour's surface that the
-    images have shown.
+    ``plan`` is what is to be followed, if anything. ``line`` is the score's, ``fault`` says why a cut is not
+    possible now; ``tumour_mm`` (k,) are the distances of the line's points from the tumour's outline,
+    ``seen_share`` is the share of the tumour's surface that the images have shown.
     """
 
     def __init__(self, anatomy: DeformedAnatomy, plan: ResectionPlan | None = None) -> None:
@@ -52,7 +54,8 @@ class ResectionView:
         self._marks: tuple[Point, ...] = ()
         self._score_skin: Skin | None = None
         self._planned: Cut | None = None
-        # Nodes and weights of the vertices of the coming specimen. Not a skin, of which there would be one for each change.
+        # Nodes and weights of the vertices of the coming specimen. Not a skin, of which there would be one
+        # for each change.
         self._carried_by: tuple[np.ndarray, np.ndarray] = np.zeros((0, 8), int), np.zeros((0, 8))
         self._of: tuple[object, ...] = ()
         self._seen = b""
@@ -120,7 +123,9 @@ class ResectionView:
         return plane_section(planned.specimen.vertices + moved, faces, np.linalg.inv(plane))
 
     def score(self, margin_mm: float) -> Score | None:
-        """The score and the planned one as they lie now, None without either; a part is near where its margin is smaller than asked."""
+        """The score and the planned one as they lie now, None without either; a part is near where its
+        margin is smaller than asked.
+        """
         if not self._marks and self._plan_skin is None:
             return None
         planned = np.zeros((0, 3))

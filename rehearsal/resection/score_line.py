@@ -13,7 +13,8 @@ LEAST_MARKS = 3
 SPACING_MM = 1.0
 # Distance of the points [mm] at which it is known which faces the line crosses.
 CROSSED_MM = 0.2
-# A mark within a face keeps this share of distance from its edges: so that no face of the divided surface is flat.
+# A mark within a face keeps this share of distance from its edges: so that no face of the divided surface is
+# flat.
 LEAST_SHARE = 0.02
 # A line that encloses less than this share of a circle of its length is folded.
 LEAST_ROUNDNESS = 0.02
@@ -27,8 +28,8 @@ class ResectionError(UserError):
 class ScoreLine:
     """A closed line on the organ's surface at rest, all in mm.
 
-    ``marks`` (n, 3) in the order of the line; ``points`` (k, 3) along it, the last one before the first; ``direction`` (3,) is the unit
-    normal of the area that it encloses, outward.
+    ``marks`` (n, 3) in the order of the line; ``points`` (k, 3) along it, the last one before the first;
+    ``direction`` (3,) is the unit normal of the area that it encloses, outward.
     """
 
     marks: np.ndarray
@@ -41,7 +42,9 @@ class ScoreLine:
         return float(np.linalg.norm(np.roll(self.points, -1, axis=0) - self.points, axis=1).sum())
 
     def frame(self) -> np.ndarray:
-        """Rows (3, 3): two axes across the direction, the first along the longest extent of the line, and the direction."""
+        """Rows (3, 3): two axes across the direction, the first along the longest extent of the line, and
+        the direction.
+        """
         across = self.points - self.points.mean(axis=0)
         across -= np.outer(across @ self.direction, self.direction)
         first = np.linalg.svd(across, full_matrices=False)[2][0]
@@ -51,8 +54,8 @@ class ScoreLine:
 def score_line(organ: trimesh.Trimesh, marks: np.ndarray) -> ScoreLine:
     """Join marks (n, 3) [mm] near a closed surface to a line, in their order around their middle.
 
-    Between neighbours it is a geodesic (Sharp & Crane 2020, "You can find geodesic paths in triangle meshes by just flipping edges").
-    Raises ResectionError.
+    Between neighbours it is a geodesic (Sharp & Crane 2020, "You can find geodesic paths in triangle meshes
+    by just flipping edges"). Raises ResectionError.
     """
     if len(marks) < LEAST_MARKS:
         raise ResectionError(
@@ -75,7 +78,9 @@ def score_line(organ: trimesh.Trimesh, marks: np.ndarray) -> ScoreLine:
 
 
 def places_on(organ: trimesh.Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The nearest places (n, 3) on a surface to points (n, 3) [mm], and the surface's normals (n, 3) there."""
+    """The nearest places (n, 3) on a surface to points (n, 3) [mm], and the surface's normals (n, 3)
+    there.
+    """
     vertices, faces = np.asarray(organ.vertices, float), np.asarray(organ.faces, np.int64)
     _, face, near = igl.point_mesh_squared_distance(np.atleast_2d(np.asarray(points, float)), vertices, faces)
     face, near = np.atleast_1d(face), np.atleast_2d(near)
@@ -83,7 +88,9 @@ def places_on(organ: trimesh.Trimesh, points: np.ndarray) -> tuple[np.ndarray, n
 
 
 def enclosed_by(organ: trimesh.Trimesh, line: ScoreLine) -> np.ndarray:
-    """Which faces (f,) of a surface a line encloses: all that it divides from the largest part, without those that it crosses."""
+    """Which faces (f,) of a surface a line encloses: all that it divides from the largest part, without
+    those that it crosses.
+    """
     ahead = np.roll(line.points, -1, axis=0) - line.points
     steps = np.arange(0.0, 1.0, CROSSED_MM / SPACING_MM)
     points = (line.points[:, None] + steps[:, None] * ahead[:, None]).reshape(-1, 3)
@@ -97,7 +104,9 @@ def enclosed_by(organ: trimesh.Trimesh, line: ScoreLine) -> np.ndarray:
 
 
 def around_middle(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """The order (n,) of points (n, 3) by their angle around their middle, seen along the mean of normals (n, 3)."""
+    """The order (n,) of points (n, 3) by their angle around their middle, seen along the mean of normals
+    (n, 3).
+    """
     mean = normals.mean(axis=0)
     axes = np.linalg.svd(mean[None])[2][1:]
     x, y = ((points - points.mean(axis=0)) @ axes.T).T
@@ -105,7 +114,9 @@ def around_middle(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def with_vertices(surface: trimesh.Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (v, 3) and faces (f, 3) of a surface on which each point (n, 3) is a vertex, and the points' vertices (n,)."""
+    """Vertices (v, 3) and faces (f, 3) of a surface on which each point (n, 3) is a vertex, and the
+    points' vertices (n,).
+    """
     vertices, faces = np.asarray(surface.vertices, float), np.asarray(surface.faces, np.int64)
     own = []
     for point in points:
@@ -131,7 +142,10 @@ def evenly_spaced(line: np.ndarray) -> np.ndarray:
 
 
 def _direction(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Unit normal (3,) of the area inside a closed line. Raises ResectionError where the line is folded, or crosses itself."""
+    """Unit normal (3,) of the area inside a closed line.
+
+    Raises ResectionError where the line is folded, or crosses itself.
+    """
     around = points - points.mean(axis=0)
     area = 0.5 * np.cross(around, np.roll(around, -1, axis=0)).sum(axis=0)
     size = float(np.linalg.norm(area))

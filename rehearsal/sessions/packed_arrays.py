@@ -1,4 +1,6 @@
-"""Arrays as text for a session's file, without loss of bits: poses, the coverage, and whole states of a rehearsal."""
+"""Arrays as text for a session's file, without loss of bits: poses, the coverage, and whole states of a
+rehearsal.
+"""
 
 import base64
 import io
@@ -27,7 +29,8 @@ from sim.solver import SolverState
 NUMBERS = 12
 # Of a wrench: force and torque.
 COMPONENTS = 6
-# A second has fewer steps; a grid of 1.5 mm over half a metre fewer voxels; all arrays of a body of a million particles fewer bytes.
+# A second has fewer steps; a grid of 1.5 mm over half a metre fewer voxels; all arrays of a body of a million
+# particles fewer bytes.
 MOST_STEPS, MOST_VOXELS, MOST_BYTES = 1_000_000, 100_000_000, 1 << 30
 
 # What NumPy and zipfile raise for unreadable data.
@@ -43,7 +46,10 @@ class StateError(ValueError):
 
 @with_config(ConfigDict(extra="forbid", strict=True))
 class SeenVoxels(TypedDict):
-    """``shape``: voxels along x, y and z. ``bits``: one for each, the last axis fastest; packed, zipped, as base64."""
+    """``shape``: voxels along x, y and z.
+
+    ``bits``: one for each, the last axis fastest; packed, zipped, as base64.
+    """
 
     shape: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=3, max_length=3)]
     bits: str

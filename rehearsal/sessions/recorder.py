@@ -33,9 +33,11 @@ NAME = r"session-([0-9]{3,9})\.jsonl"
 
 
 class SessionRecorder:
-    """The file of a session. A thread writes, so that the rehearsal does not wait for the disk. ``coverage`` returns what was imaged so far.
+    """The file of a session. A thread writes, so that the rehearsal does not wait for the disk. ``coverage``
+    returns what was imaged so far.
 
-    Raises OSError if the file cannot be created; a later error is in ``fault`` and among the notices, and the rehearsal continues.
+    Raises OSError if the file cannot be created; a later error is in ``fault`` and among the notices, and the
+    rehearsal continues.
     """
 
     def __init__(

@@ -1,4 +1,6 @@
-"""Replay a recorded session, bit for bit: a source of its commands, and an observer that compares the tissue."""
+"""Replay a recorded session, bit for bit: a source of its commands, and an observer that compares the
+tissue.
+"""
 
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -30,7 +32,8 @@ MOST_DUE_S = 0.25
 class Replay:
     """A ``Source``: the commands of a log in real time, or ``one_by_one``, with a state for each frame.
 
-    ``place`` is the index of the next command. Raises SessionError where the log's states belong to another body.
+    ``place`` is the index of the next command. Raises SessionError where the log's states belong to another
+    body.
     """
 
     def __init__(self, log: Log, one_by_one: bool = False) -> None:
@@ -56,7 +59,8 @@ class Replay:
         return f"REPLAY   {self.time_s:.1f} s   {{take_over}} takes control"
 
     def begin(self, positions: np.ndarray, seconds: float = 0.0) -> Iterator[Command]:
-        """The commands that restore the last recorded state before a time [s] from which the rest can be replayed.
+        """The commands that restore the last recorded state before a time [s] from which the rest can be
+        replayed.
 
         ``positions`` (n, 3) are those of the body. Raises SessionError.
         """
@@ -82,7 +86,10 @@ class Replay:
         )
 
     def commands(self, frame: Frame, controls: Controls, elapsed_s: float) -> Iterator[Command]:
-        """As ``Source.commands``: those of a time [s], unless the steps before are not made yet. Raises SessionError."""
+        """As ``Source.commands``: those of a time [s], unless the steps before are not made yet.
+
+        Raises SessionError.
+        """
         self.check(frame)
         if self._one_by_one:
             yield from self._next()
@@ -105,7 +112,8 @@ class Replay:
         for event in frame.events:
             if isinstance(event, Refused):
                 raise SessionError(
-                    f"the session's {event.command.kind} cannot be repeated: {event.reason}; its file is damaged, or of another body"
+                    f"the session's {event.command.kind} cannot be repeated: {event.reason}; its file is "
+                    "damaged, or of another body"
                 )
 
     def until(self, seconds: float) -> Iterator[tuple[Command, ...]]:
@@ -139,7 +147,9 @@ class Replay:
         return self.log.commands[place][0] if place < len(self.log.commands) else self.log.last_number
 
     def _start(self, most: int) -> tuple[int, set[int]]:
-        """The place at most so far from which the rest can be replayed, and the recorded states before it that the rest restores."""
+        """The place at most so far from which the rest can be replayed, and the recorded states before it
+        that the rest restores.
+        """
         log, restored = self.log, self.log.restored()
         places = {self._number_at(place): place for place in range(most, -1, -1)}
         for number in sorted((n for n in log.states if n in places), reverse=True):
@@ -159,8 +169,8 @@ class Replay:
 class ReplayCheck:
     """An ``Observer`` that compares a replay with its log, and says once where the tissue differs.
 
-    ``differs_s`` is the time [s] from which on it does, None where it does not; ``digest`` is that of the last comparison, at a time
-    ``compared_s``.
+    ``differs_s`` is the time [s] from which on it does, None where it does not; ``digest`` is that of the
+    last comparison, at a time ``compared_s``.
     """
 
     def __init__(self, log: Log, notices: Notices) -> None:
@@ -202,7 +212,8 @@ def open_session(
     measurements: LiveMeasurements,
     observers: list[Observer],
 ) -> None:
-    """Take a rehearsal to a time [s] of a session: the tissue, the settings, the measurements and the coverage until then.
+    """Take a rehearsal to a time [s] of a session: the tissue, the settings, the measurements and the
+    coverage until then.
 
     Raises SessionError.
     """
@@ -223,7 +234,8 @@ def open_session(
     begins, aim = frame.number, replay.log.place_at(at_s)
     if not measurements.recall(replay.log, begins):
         click.echo(
-            f"Warning: the session has no record of the coverage until {replay.time_s:.0f} s; coverage and summary begin there."
+            f"Warning: the session has no record of the coverage until {replay.time_s:.0f} s; coverage and "
+            "summary begin there."
         )
     for commands in tqdm(replay.until(at_s), desc=f"to {at_s:g} s", total=aim, unit="step", disable=aim == 0):
         frame = apply(commands)

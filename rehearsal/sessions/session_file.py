@@ -1,8 +1,10 @@
-"""The file of a session: a line of JSON for each command, with the number of the state that it was applied to.
+"""The file of a session: a line of JSON for each command, with the number of the state that it was applied
+to.
 
-The first line names what is rehearsed. Moves are packed, those of a second or up to the next command in a line. Beside them are hashes of
-the tissue, whole states with the coverage, measurements, and in the last line the summary. Each line is on the disk when it is written, so
-that a crash costs a second at most. No line names a patient or a path.
+The first line names what is rehearsed. Moves are packed, those of a second or up to the next command in a
+line. Beside them are hashes of the tissue, whole states with the coverage, measurements, and in the last line
+the summary. Each line is on the disk when it is written, so that a crash costs a second at most. No line
+names a patient or a path.
 """
 
 from dataclasses import dataclass, field
@@ -77,7 +79,8 @@ class Header(_Line):
         found = values.get("nephron_session") if isinstance(values, dict) else None
         if isinstance(found, int) and 0 < found < SESSION_FORMAT:
             raise ValueError(
-                f"nephron_session = {found}: recorded by Nephron {found}, which replays it; record the session anew with this one"
+                f"nephron_session = {found}: recorded by Nephron {found}, which replays it; record the "
+                "session anew with this one"
             )
         if found is not None and found != SESSION_FORMAT:
             raise ValueError(f"nephron_session = {FOUND.repr(found)}: expected {SESSION_FORMAT}")
@@ -92,8 +95,8 @@ class CommandLine(_Line):
 
 
 class MovesLine(_Line):
-    """Moves from the state of a number on, packed: poses, lengths where one is not the header's, and wrenches (force [N] of the tissue on
-    the probe, torque [N mm] about the centre of the array face, LPS).
+    """Moves from the state of a number on, packed: poses, lengths where one is not the header's, and wrenches
+    (force [N] of the tissue on the probe, torque [N mm] about the centre of the array face, LPS).
     """
 
     at: int = Field(ge=0)
@@ -143,7 +146,9 @@ LINES: dict[str, type[_Line]] = dict(
 
 @dataclass
 class Log:
-    """A session as read: its ``commands`` in their order, each with the number of the state that it was applied to; the rest by number."""
+    """A session as read: its ``commands`` in their order, each with the number of the state that it was
+    applied to; the rest by number.
+    """
 
     header: Header
     commands: list[tuple[int, Recorded | Move]] = field(default_factory=list)
@@ -174,7 +179,9 @@ class Log:
         return np.cumsum(lengths)
 
     def place_at(self, seconds: float) -> int:
-        """How many commands come before a time [s]: up to the move whose end is nearest to it, or all at the end."""
+        """How many commands come before a time [s]: up to the move whose end is nearest to it, or all at
+        the end.
+        """
         ends_s = self.ends_s
         if not self.commands or seconds >= ends_s[-1] - ROUNDING_S:
             return len(self.commands)
@@ -182,7 +189,9 @@ class Log:
         return int(np.argmin(np.abs(starts_s - seconds)))
 
     def restored(self) -> list[tuple[int, int, History]]:
-        """For each command that restores a state its place, the number of that state, and the history before it."""
+        """For each command that restores a state its place, the number of that state, and the history
+        before it.
+        """
         found, history = [], History()
         for place, (number, command) in enumerate(self.commands):
             after, to = history_after(history, number, command)
@@ -193,7 +202,9 @@ class Log:
 
 
 def history_after(history: History, number: int, command: Recorded | Move) -> tuple[History, int | None]:
-    """The history after a command that was applied to the state of a number, and the number of the state that it restored."""
+    """The history after a command that was applied to the state of a number, and the number of the state
+    that it restored.
+    """
     match command:
         case BeginAction() | Mark() | CutOut():
             return history.begun(number), None
@@ -306,7 +317,8 @@ def _header(name: str, line: bytes) -> Header:
     except (ValidationError, TextError) as error:
         what = explained(error) if isinstance(error, ValidationError) else error
         raise SessionError(
-            f"{name}: not a session of this version ({what}); expected a file that rehearse has written, such as session-001.jsonl"
+            f"{name}: not a session of this version ({what}); expected a file that rehearse has written, "
+            "such as session-001.jsonl"
         ) from None
 
 
@@ -318,7 +330,8 @@ def _line_of(name: str, count: int, text: bytes) -> _Line:
     except (ValidationError, TextError) as error:
         what = explained(error) if isinstance(error, ValidationError) else error
         raise SessionError(
-            f"{name}: line {count} is damaged ({what}); what comes before it can be had by deleting from it on"
+            f"{name}: line {count} is damaged ({what}); what comes before it can be had by deleting from it "
+            "on"
         ) from None
 
 

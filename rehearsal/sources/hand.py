@@ -9,7 +9,10 @@ Ray = tuple[np.ndarray, np.ndarray]
 
 
 class Hand:
-    """What mouse, keys and gamepad ask of the manipulator. ``waits``: the transducer stays until the user moves it."""
+    """What mouse, keys and gamepad ask of the manipulator.
+
+    ``waits``: the transducer stays until the user moves it.
+    """
 
     def __init__(self, manipulator: ProbeManipulator, waits: bool = False) -> None:
         self.manipulator, self.waits = manipulator, waits

@@ -30,7 +30,10 @@ class ScriptedPress:
 
 
 class ReplaySource:
-    """A ``Source``: a recorded session, until it ends or the user takes over. From then on what ``user()`` makes, in a new session."""
+    """A ``Source``: a recorded session, until it ends or the user takes over.
+
+    From then on what ``user()`` makes, in a new session.
+    """
 
     def __init__(self, replay: Replay, user: Callable[[], Source], notices: Notices) -> None:
         self.replay, self._make_user, self._notices = replay, user, notices

@@ -1,4 +1,6 @@
-"""A tracked probe moves the transducer: the newest pose of a tracker, or the poses of a file at the rehearsal's time."""
+"""A tracked probe moves the transducer: the newest pose of a tracker, or the poses of a file at the
+rehearsal's time.
+"""
 
 from collections.abc import Callable
 
@@ -10,7 +12,8 @@ from rehearsal.tracking.pose_file import TimedPoses
 
 # A resting probe moves less than this: tremor of a hand, and noise of a tracker.
 STILL_MM, STILL_DEG = 3.0, 3.0
-# Gives the probe's pose in the patient (4, 4), in PLUS's axes (LPS, mm), at a time [s] of the session; None while it is not tracked.
+# Gives the probe's pose in the patient (4, 4), in PLUS's axes (LPS, mm), at a time [s] of the session; None
+# while it is not tracked.
 # May raise TrackEnded.
 PoseSource = Callable[[float], np.ndarray | None]
 
@@ -41,7 +44,10 @@ class Tracker:
         self._waits, self._resting_pose = True, None
 
     def goal(self, time_s: float) -> np.ndarray | None:
-        """The transducer's next goal (4, 4) at a time [s] of the session; None to stay. May raise TrackEnded."""
+        """The transducer's next goal (4, 4) at a time [s] of the session; None to stay.
+
+        May raise TrackEnded.
+        """
         pose = self.tracked(time_s)
         self.is_lost = pose is None
         if pose is None:

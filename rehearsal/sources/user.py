@@ -1,4 +1,6 @@
-"""The user: mouse, keys and gamepad, or a tracked probe, move the transducer; settings, undo, bookmarks, and the operation."""
+"""The user: mouse, keys and gamepad, or a tracked probe, move the transducer; settings, undo, bookmarks,
+and the operation.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -36,15 +38,16 @@ from ultrasound.probe_manipulator import ManipulatorState, ProbeManipulator
 
 # A transducer that moves by no more than this between two frames is at rest [mm].
 STILL_MM = 1e-3
-# Input that follows the last one sooner than this belongs to the same action; an action lasts no longer than that.
+# Input that follows the last one sooner than this belongs to the same action; an action lasts no longer than
+# that.
 PAUSE_S, LONGEST_S = 0.5, 5.0
 
 
 class UserSource:
     """A ``Source``: the user moves the transducer by ``hand``, or by a tracked probe if there is one.
 
-    After undo, redo, reset or a bookmark the transducer stays until the user moves it. ``is_seen`` says which points the images have
-    shown; without it all count as seen.
+    After undo, redo, reset or a bookmark the transducer stays until the user moves it. ``is_seen`` says which
+    points the images have shown; without it all count as seen.
     """
 
     def __init__(
@@ -204,7 +207,8 @@ class UserSource:
             )
         planned = self._plan.best
         self.notices.post(
-            f"Planned line: for {planned.technique} with a margin of {self._plan.margin_mm:g} mm; {{technique}} chooses the technique"
+            f"Planned line: for {planned.technique} with a margin of {self._plan.margin_mm:g} mm; "
+            f"{{technique}} chooses the technique"
         )
         return places_at_rest(self.anatomy.case, np.array(planned.marks_mm))
 

@@ -40,7 +40,8 @@ def open_link(asked: LinkOptions) -> "OpenIGTLinkServer | None":
     except (OSError, UnicodeError) as error:  # UnicodeError: a text that cannot be a host name
         reason = getattr(error, "strerror", None) or "not a host name"
         raise CommandError(
-            f"--link: {host} port {port} cannot be opened ({reason}); end the program that uses it, or choose another --link-host or "
+            f"--link: {host} port {port} cannot be opened ({reason}); end the program that uses it, or "
+            "choose another --link-host or "
             "--link-port"
         ) from None
     click.get_current_context().with_resource(server)

@@ -1,10 +1,12 @@
-"""An OpenIGTLink server: the live image and the probe's pose out, a tracked pose in, with the names of PLUS and 3D Slicer.
+"""An OpenIGTLink server: the live image and the probe's pose out, a tracked pose in, with the names of PLUS
+and 3D Slicer.
 
-A transform is named by its two coordinate systems, such as ``ImageToProbe``. Image is in pixels (column, row, 0), the others in mm.
-Reference is the patient: RAS in messages, as Slicer's world is, and LPS in the program.
+A transform is named by its two coordinate systems, such as ``ImageToProbe``. Image is in pixels (column, row,
+0), the others in mm. Reference is the patient: RAS in messages, as Slicer's world is, and LPS in the program.
 
-The messages are pyigtl's, the sockets asyncio's: pyigtl's own server serves one client at a time, prints a traceback when it leaves,
-cannot be ended after half a header, takes over the signals of the process, and listens on the first network card or on none.
+The messages are pyigtl's, the sockets asyncio's: pyigtl's own server serves one client at a time, prints a
+traceback when it leaves, cannot be ended after half a header, takes over the signals of the process, and
+listens on the first network card or on none.
 """
 
 import asyncio
@@ -32,7 +34,8 @@ FORCE = "ProbeForce"
 # Its own inverse.
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 HEADER_VERSIONS = (1, 2)
-# Type and name of a message, in bytes of its header: texts that end at the first NUL; what follows them may be anything.
+# Type and name of a message, in bytes of its header: texts that end at the first NUL; what follows them may
+# be anything.
 TEXTS = slice(2, 14), slice(14, 34)
 # The header's last number; some programs send 0 instead of computing it.
 CHECKSUM_BYTES = 8
@@ -42,7 +45,8 @@ TRANSFORM_BYTES, CHUNK_BYTES = 1 << 16, 1 << 16
 HAND_TO_REFERENCE = "HandToReference"
 STALE_S = 1.0
 FARTHEST_MM = 10_000.0
-# More clients are not served. One that takes no data for so long, or does not end its message, is disconnected.
+# More clients are not served. One that takes no data for so long, or does not end its message, is
+# disconnected.
 MOST_CLIENTS, IDLE_S = 8, 30.0
 
 
@@ -78,17 +82,19 @@ class ReceivedPose:
         if not self._has_refused:
             self._has_refused = True
             self._message(
-                f"Warning: {HAND_TO_REFERENCE} of the link is not a rigid transform within {FARTHEST_MM / 1000:.0f} m: it is ignored; "
+                f"Warning: {HAND_TO_REFERENCE} of the link is not a rigid transform within "
+                f"{FARTHEST_MM / 1000:.0f} m: it is ignored; "
                 "send a rotation and a translation in mm"
             )
 
 
 class OpenIGTLinkServer:
-    """Sends the newest image to each client; ``received_pose`` is the pose that clients send, ``damaged_messages`` counts what had a
-    wrong checksum.
+    """Sends the newest image to each client; ``received_pose`` is the pose that clients send,
+    ``damaged_messages`` counts what had a wrong checksum.
 
-    One thread packs, sends and reads; a slow client skips images. Listens from the start, on a free port where ``port`` is 0; raises
-    OSError where it cannot, UnicodeError for a text that cannot be a host's name. As a context manager it closes at the end.
+    One thread packs, sends and reads; a slow client skips images. Listens from the start, on a free port
+    where ``port`` is 0; raises OSError where it cannot, UnicodeError for a text that cannot be a host's name.
+    As a context manager it closes at the end.
     """
 
     def __init__(self, host: str, port: int, message: Callable[[str], None]) -> None:
@@ -124,9 +130,9 @@ class OpenIGTLinkServer:
     ) -> None:
         """Send an image and its pose to all clients; the arrays must not change any more.
 
-        ``grey`` is uint8 (rows, columns) in orientation MF; ``image_to_probe`` and ``probe_in_patient`` are (4, 4) [mm, LPS], in PLUS's
-        axes of the probe. ``time_s`` is the rehearsal's time. ``wrench`` (6,): force [N] of the tissue on the probe and torque [N mm] about
-        the centre of the array face (LPS).
+        ``grey`` is uint8 (rows, columns) in orientation MF; ``image_to_probe`` and ``probe_in_patient`` are
+        (4, 4) [mm, LPS], in PLUS's axes of the probe. ``time_s`` is the rehearsal's time. ``wrench`` (6,):
+        force [N] of the tissue on the probe and torque [N mm] about the centre of the array face (LPS).
         """
         probe = RAS_FROM_LPS @ probe_in_patient
         messages: tuple[MessageBase, ...] = (
@@ -214,7 +220,10 @@ class OpenIGTLinkServer:
                 )
 
     async def _read_message(self, first: bytes, reader: asyncio.StreamReader) -> None:
-        """Take the message that begins with a byte; all but transforms are skipped. Raises MessageError, EOFError, OSError."""
+        """Take the message that begins with a byte; all but transforms are skipped.
+
+        Raises MessageError, EOFError, OSError.
+        """
         header = first + await reader.readexactly(MessageBase.IGTL_HEADER_SIZE - 1)
         try:
             fields = MessageBase.parse_header(_without_rests(header))
@@ -236,7 +245,8 @@ class OpenIGTLinkServer:
             self.damaged_messages += 1
             if self.damaged_messages == 1:
                 self._message(
-                    "Warning: a message of the link is damaged (wrong checksum): it is ignored, as are more like it; check the program "
+                    "Warning: a message of the link is damaged (wrong checksum): it is ignored, as are more "
+                    "like it; check the program "
                     "that sends it, and the network"
                 )
             return

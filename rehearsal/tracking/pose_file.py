@@ -13,7 +13,8 @@ from rehearsal.resection.script import Number, ScriptedAction, ScriptedCut
 from text_files import TABLES, TextError, json_value, read_text, table_rows
 from ultrasound.probe_manipulator import interpolated
 
-# Tolerance of orthonormal axes: more than the rounding of six digits in a file or of a float32, less than a scaled matrix.
+# Tolerance of orthonormal axes: more than the rounding of six digits in a file or of a float32, less than a
+# scaled matrix.
 RIGID = 1e-3
 EXPECTED = "expected poses as JSON or CSV"
 SIXTEEN = "sixteen, row by row, or before them the time in s"
@@ -68,7 +69,9 @@ class _FilePose(BaseModel):
     time_s: float | None = None
     probe_to_patient: Pose
     score: Literal["image"] | Annotated[list[Place], Field(min_length=1)] | None = None
-    """Set marks of the score: at the edges of tumour and margin in the image, or at these places (LPS, mm)."""
+    """Set marks of the score: at the edges of tumour and margin in the image, or at these places (LPS,
+    mm).
+    """
     margin_mm: float = Field(5.0, ge=0, le=20)
     cut: ScriptedCut | None = None
     """Cut along the score."""
@@ -83,7 +86,8 @@ class _FilePose(BaseModel):
 
 @dataclass(frozen=True)
 class TimedPoses:
-    """Poses (4, 4) of a probe, None where it was not tracked, at times (n,) [s]. Raises PoseError unless the times increase.
+    """Poses (4, 4) of a probe, None where it was not tracked, at times (n,) [s]. Raises PoseError unless the
+    times increase.
 
     ``actions`` are those of a resection, at times after the first pose.
     """
@@ -106,7 +110,9 @@ class TimedPoses:
         return float(self.times_s[-1] - self.times_s[0])
 
     def at(self, time_s: float) -> np.ndarray | None:
-        """The pose (4, 4) at a time after the first, interpolated between two; None where one of the two was not tracked."""
+        """The pose (4, 4) at a time after the first, interpolated between two; None where one of the two
+        was not tracked.
+        """
         times, last = self.times_s - self.times_s[0], len(self.times_s) - 1
         after = min(int(np.searchsorted(times, time_s)), last)
         end = self.poses[after]
@@ -123,9 +129,9 @@ class TimedPoses:
 def load_poses(path: Path) -> dict[str, np.ndarray]:
     """Name -> pose (4, 4), probe to patient (LPS, mm), from a JSON or CSV file. Raises PoseError.
 
-    The probe's axes are PLUS's: the origin at the centre of the array face, x to the marked side, y into the tissue, z = x cross y.
-    JSON holds a list of {"name": ..., "probe_to_patient": 4 x 4}, CSV sixteen numbers per line, row by row. Poses without a name are
-    numbered. Times are ignored.
+    The probe's axes are PLUS's: the origin at the centre of the array face, x to the marked side, y into the
+    tissue, z = x cross y. JSON holds a list of {"name": ..., "probe_to_patient": 4 x 4}, CSV sixteen numbers
+    per line, row by row. Poses without a name are numbered. Times are ignored.
     """
     poses: dict[str, np.ndarray] = {}
     for number, placed in enumerate(_read(path), 1):
@@ -138,12 +144,16 @@ def load_poses(path: Path) -> dict[str, np.ndarray]:
 
 
 def load_timed_poses(path: Path) -> TimedPoses:
-    """The poses of such a file with their times [s]: "time_s" in JSON, a number before the sixteen in CSV. Raises PoseError."""
+    """The poses of such a file with their times [s]: "time_s" in JSON, a number before the sixteen in CSV.
+
+    Raises PoseError.
+    """
     placed = _read(path)
     for number, each in enumerate(placed, 1):
         if each.time_s is None:
             raise PoseError(
-                f"{path}: pose {number} has no time; expected time_s in JSON, or in CSV seconds and sixteen numbers per line"
+                f"{path}: pose {number} has no time; expected time_s in JSON, or in CSV seconds and sixteen "
+                "numbers per line"
             )
     times_s = np.array([each.time_s for each in placed])
     actions = [each.action(times_s[0]) for each in placed]
@@ -181,7 +191,8 @@ def _pose(path: Path, number: int, values: Any, strict: bool) -> _FilePose:
         return _FilePose.model_validate(values, strict=strict)
     except ValidationError as error:
         raise PoseError(
-            f"{path}: pose {number}, {explained(error)}; expected a list of poses with probe_to_patient, 4 rows of 4 numbers"
+            f"{path}: pose {number}, {explained(error)}; expected a list of poses with probe_to_patient, 4 "
+            "rows of 4 numbers"
         ) from None
 
 
@@ -191,7 +202,8 @@ def _of_table(path: Path, table: dict[int, list[str]]) -> list[dict[str, Any]]:
     for number, row in enumerate(rows, 1):
         if len(row) not in (16, 17) or len(row) != len(rows[0]):
             raise PoseError(
-                f"{path}: pose {number}: {len(row)} numbers; expected {SIXTEEN}, as in each line, separated by commas, or by "
+                f"{path}: pose {number}: {len(row)} numbers; expected {SIXTEEN}, as in each line, separated "
+                "by commas, or by "
                 "semicolons where there are decimal commas"
             )
     poses = [dict(probe_to_patient=np.reshape(row[-16:], (4, 4)).tolist()) for row in rows]

@@ -59,7 +59,8 @@ class SweepRecorder:
     def add(self, time_s: float, view: View, probe: Probe) -> None:
         """Add the current image where a frame is due."""
         kind, image = next(iter(view.images.items()))
-        # After the end of a replay another session begins, with its own time; a volume of B-mode and CT images would be neither.
+        # After the end of a replay another session begins, with its own time; a volume of B-mode and CT
+        # images would be neither.
         if time_s < self._due_s - FRAME_S - 1e-9 or (self._image_kind and kind != self._image_kind):
             self.end()
         if self._sweep is None or time_s < self._due_s - 1e-9 or self.anatomy.scanner is None:

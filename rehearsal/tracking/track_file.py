@@ -16,21 +16,24 @@ FAR_MM = 50.0
 
 
 def load_track(path: Path, name: str | None = None) -> TimedPoses:
-    """The poses of a probe in the patient, from a tracked sweep (.igs.mha, .igs.nrrd), the first sweep of a plan, or a pose file with times.
+    """The poses of a probe in the patient, from a tracked sweep (.igs.mha, .igs.nrrd), the first sweep of a
+    plan, or a pose file with times.
 
-    ``name`` is the sweep's transform from the probe to the patient, ProbeToReference where it is None. Raises PoseError, SweepError,
-    PlanError.
+    ``name`` is the sweep's transform from the probe to the patient, ProbeToReference where it is None. Raises
+    PoseError, SweepError, PlanError.
     """
     if path.suffix.lower() in (".mha", ".nrrd"):
         return _sweep_poses(path, name or PROBE_IN_PATIENT)
     if path.suffix.lower() in (".mhd", ".nhdr"):
         raise SweepError(
-            f"{path.name}: is a header whose images are in another file; expected a sweep in one file (.igs.mha, .igs.nrrd), a plan, or "
+            f"{path.name}: is a header whose images are in another file; expected a sweep in one file "
+            "(.igs.mha, .igs.nrrd), a plan, or "
             "poses with times (.json, .csv); save it as .igs.mha, as PLUS and 3D Slicer do"
         )
     if name is not None:
         raise PoseError(
-            f"--track-from {name}: names a transform of a sweep, and {path.name} is not a sweep (.igs.mha, .igs.nrrd); leave it out"
+            f"--track-from {name}: names a transform of a sweep, and {path.name} is not a sweep (.igs.mha, "
+            ".igs.nrrd); leave it out"
         )
     if is_plan(path):
         plan = read_plan(path)
@@ -44,7 +47,8 @@ def check_near(track: TimedPoses, organ: np.ndarray, path: Path) -> None:
     nearest = float(cKDTree(organ).query(places)[0].min())
     if nearest > FAR_MM:
         raise PoseError(
-            f"{path.name}: the nearest pose is {nearest:.0f} mm from the organ; expected the probe's poses in this patient "
+            f"{path.name}: the nearest pose is {nearest:.0f} mm from the organ; expected the probe's poses "
+            "in this patient "
             "(LPS, mm): register the tracker to the patient first"
         )
 

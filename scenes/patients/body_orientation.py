@@ -1,4 +1,5 @@
-"""Whether a CT shows the body as its header says it lies: spine behind, liver on the right, lungs above the kidneys.
+"""Whether a CT shows the body as its header says it lies: spine behind, liver on the right, lungs above the
+kidneys.
 
 A header may be wrong, and labels of the CT are wrong with it: only the anatomy can object.
 """
@@ -23,8 +24,9 @@ LIVER_LEFT_MM = 15.0
 
 # The grid on which organs are searched by HU alone: the mean of the voxels in each cell.
 CELL_MM = 4.0
-# The liver is the largest body of one HU on one side: enhanced 80 to 150 HU, unenhanced 40 to 65. Of the two CTs used in development it has 950
-# and 740 ml, and the largest other one (muscle of the back, stomach) 240 and 260 ml.
+# The liver is the largest body of one HU on one side: enhanced 80 to 150 HU, unenhanced 40 to 65. Of the two
+# CTs used in development it has 950 and 740 ml, and the largest other one (muscle of the back, stomach) 240
+# and 260 ml.
 LIVER_HU, HALF_WIDTH_HU, EVEN_SD_HU = range(-15, 200, 15), 15.0, 25.0
 LEAST_LIVER_ML, CLEARLY, LEAST_LATERAL_MM = 400.0, 2.5, 30.0
 LABELLED_HU = -1000.0
@@ -83,7 +85,9 @@ def _cells(overview: sitk.Image) -> tuple[VoxelGrid, np.ndarray]:
 
 
 def _liver(grid: VoxelGrid, mean: np.ndarray, labels: LabelMap, midline: float) -> np.ndarray | None:
-    """The middle (3,) of the liver, LPS [mm]: as labelled, or else of the clearly largest even body beside the midline."""
+    """The middle (3,) of the liver, LPS [mm]: as labelled, or else of the clearly largest even body beside
+    the midline.
+    """
     liver = among(labels.values, labels.of_tissues("liver"))
     if liver.any():
         step = max(1, int(COARSE_MM / labels.grid.spacing.min()))
@@ -116,7 +120,8 @@ def _even_bodies(grid: VoxelGrid, mean: np.ndarray) -> Iterator[tuple[float, np.
 
 def _lungs_z(grid: VoxelGrid, mean: np.ndarray) -> float | None:
     """LPS z [mm] of the lungs' middle, if there are lungs. Gas in the bowel is in smaller pieces."""
-    # A slice is a plane across the body's length in most CTs; in others the holes are open, and nothing is found.
+    # A slice is a plane across the body's length in most CTs; in others the holes are open, and nothing is
+    # found.
     inside = ndimage.binary_fill_holes(mean > BODY_ABOVE_HU, np.ones((1, 3, 3)))
     parts, count = ndimage.label(ndimage.binary_opening(inside & (mean > LUNG_HU[0]) & (mean < LUNG_HU[1])))
     volumes = np.bincount(parts.ravel(), minlength=count + 1) * grid.voxel_ml

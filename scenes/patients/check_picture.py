@@ -1,4 +1,6 @@
-"""The summary of an import, and its check image: slices with outlines, the surfaces, orientation letters, the summary."""
+"""The summary of an import, and its check image: slices with outlines, the surfaces, orientation letters,
+the summary.
+"""
 
 import textwrap
 from dataclasses import dataclass
@@ -45,7 +47,8 @@ LEAST_BRIGHT = 0.85
 LEAST_DIFFERENCE = 20.0
 # Lengths of the scale bar, and its largest share of the image's width: the letter is in the middle.
 BARS_MM, BAR_SHARE = (50.0, 20.0), 0.4
-# Letters in a line of the largest text, its sizes [points], and lines times size that fit above the names of the colours.
+# Letters in a line of the largest text, its sizes [points], and lines times size that fit above the names of
+# the colours.
 TEXT_WIDTH = 56
 TEXT_POINTS = (8.5, 8.0, 7.5, 7.0, 6.5, 6.0, 5.5, 5.0)
 TEXT_HEIGHT = 188.0
@@ -70,7 +73,9 @@ DRAFT = "made by region growing from a seed, drawn by nobody: check every outlin
 
 @dataclass(frozen=True)
 class CheckView:
-    """A slice in radiological convention: the image's right and down axes in LPS, and the orientation letters."""
+    """A slice in radiological convention: the image's right and down axes in LPS, and the orientation
+    letters.
+    """
 
     name: str
     right: tuple[int, int, int]
@@ -78,7 +83,9 @@ class CheckView:
     letters: tuple[str, str, str, str]  # left, right, top, bottom
 
     def position(self, place: np.ndarray) -> str:
-        """Where the slice through a place (3,) [mm] lies, as viewers of CT write it: ``S 118 mm`` is 118 mm towards the head."""
+        """Where the slice through a place (3,) [mm] lies, as viewers of CT write it: ``S 118 mm`` is 118
+        mm towards the head.
+        """
         axis = int(np.argmax(np.abs(np.cross(self.right, self.down))))
         return f"{SIDES[axis][int(place[axis] < 0)]} {abs(place[axis]):.0f} mm"
 
@@ -92,7 +99,9 @@ OVERVIEW = CheckView("coronal, full width", (1, 0, 0), (0, 0, -1), ("R", "L", "S
 
 
 def summary_rows(patient: Patient, complexity: Complexity | None = None) -> list[tuple[str, str]]:
-    """The summary for the terminal and the check image: a title and a line each, without names, dates or paths."""
+    """The summary for the terminal and the check image: a title and a line each, without names, dates or
+    paths.
+    """
     volumes = patient.volumes_ml
     size = " x ".join(str(n) for n in patient.ct.GetSize())
     spacing = " x ".join(f"{s:.2f}" for s in patient.source.spacing)
@@ -127,7 +136,9 @@ def as_table(rows: list[tuple[str, str]]) -> str:
 
 
 def draw_check(patient: Patient, rows: list[tuple[str, str]], folder: Path) -> None:
-    """Draw check.png into a folder: slices through the tumour, or else the organ, the surfaces and the summary."""
+    """Draw check.png into a folder: slices through the tumour, or else the organ, the surfaces and the
+    summary.
+    """
     figure = Figure(figsize=(13, 9.6), facecolor=BACKGROUND)
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 3, hspace=0.08, wspace=0.06)
@@ -279,7 +290,9 @@ def _draw_words(axes: Axes, rows: list[tuple[str, str]], shown: dict[str, Colour
 
 
 def _fitted(rows: list[tuple[str, str]]) -> tuple[str, float]:
-    """The rows as text, and the largest font size [points] at which it fits above the names of the colours."""
+    """The rows as text, and the largest font size [points] at which it fits above the names of the
+    colours.
+    """
     for points in TEXT_POINTS:
         width = round(TEXT_WIDTH * TEXT_POINTS[0] / points)
         lines = []

@@ -1,7 +1,8 @@
-"""What a user corrected in a class image (``scenes/tissue_classes/class_image.py``): where it differs from the classification.
+"""What a user corrected in a class image (``scenes/tissue_classes/class_image.py``): where it differs from
+the classification.
 
-The kidney, its tumour and what else was labelled come from the other labels: a class image says of what tissue their surroundings and the
-parts of the kidney are.
+The kidney, its tumour and what else was labelled come from the other labels: a class image says of what
+tissue their surroundings and the parts of the kidney are.
 """
 
 from collections.abc import Sequence
@@ -36,7 +37,8 @@ def corrections_of(
     organ: trimesh.Trimesh,
     classes: Sequence[LabelMap],
 ) -> tuple[sitk.Image | None, list[str]]:
-    """Return codes of TISSUES where class images correct the classification, 0 elsewhere, uint8 on its fine grid, and notes.
+    """Return codes of TISSUES where class images correct the classification, 0 elsewhere, uint8 on its fine
+    grid, and notes.
 
     None where they correct nothing.
 
@@ -57,9 +59,8 @@ def corrections_of(
     taken = changed & _may_be(stated, own, found.codes)
     texts = {
         "corrected by the class image": _changes(found.codes, stated, taken, fine),
-        "not taken from the class image, as the labels say where kidney, tumours, cysts and other labelled tissues are": (
-            _changes(found.codes, stated, changed & ~taken, fine)
-        ),
+        "not taken from the class image, as the labels say where kidney, tumours, cysts and other "
+        "labelled tissues are": (_changes(found.codes, stated, changed & ~taken, fine)),
         "left out of the class image, as drawn from an atlas": _drawn(classes),
     }
     notes = [f"{text}: {listed(names)}" for text, names in texts.items() if names]
@@ -71,7 +72,8 @@ def corrections_of(
 def _stated(classes: Sequence[LabelMap], fine: VoxelGrid, found: np.ndarray) -> np.ndarray:
     """Return what class images say (nx, ny, nz), as codes of TISSUES; 0 where they say nothing.
 
-    Where several layers of a file say something, what differs from ``found`` counts. Sheets are of the tissue that they were drawn in.
+    Where several layers of a file say something, what differs from ``found`` counts. Sheets are of the tissue
+    that they were drawn in.
     """
     stated, sheets = np.zeros(found.shape, np.uint8), np.zeros(found.shape, bool)
     for one in classes:
@@ -91,7 +93,9 @@ def _stated(classes: Sequence[LabelMap], fine: VoxelGrid, found: np.ndarray) -> 
 
 
 def _may_be(stated: np.ndarray, own: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Return whether what a class image says counts, where the labels say ``own``: the kidney's surface leaves out some of its voxels."""
+    """Return whether what a class image says counts, where the labels say ``own``: the kidney's surface
+    leaves out some of its voxels.
+    """
     kidney = own == CODE["kidney"]
     within = kidney & of_tissues(found, "kidney", *PARTS_OF_KIDNEY)
     beside = ((own == 0) | kidney) & ~within
@@ -101,7 +105,9 @@ def _may_be(stated: np.ndarray, own: np.ndarray, found: np.ndarray) -> np.ndarra
 
 
 def _changes(found: np.ndarray, stated: np.ndarray, where: np.ndarray, grid: VoxelGrid) -> list[str]:
-    """Return in words what was found to be one tissue and is said to be another, the largest volumes first."""
+    """Return in words what was found to be one tissue and is said to be another, the largest volumes
+    first.
+    """
     ml = np.bincount(256 * found[where].astype(int) + stated[where], minlength=1) * grid.voxel_ml
     largest = [int(n) for n in np.argsort(ml)[::-1] if ml[n] >= LEAST_ML]
     return [f"{TISSUES[n // 256 - 1]} is {TISSUES[n % 256 - 1]} ({ml[n]:.1f} ml)" for n in largest]

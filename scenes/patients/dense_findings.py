@@ -1,4 +1,6 @@
-"""What an import says of dense pieces in a kidney: contrast agent or stone, as ``scenes/tissue_classes/collecting_system.py`` decides."""
+"""What an import says of dense pieces in a kidney: contrast agent or stone, as
+``scenes/tissue_classes/collecting_system.py`` decides.
+"""
 
 import numpy as np
 import SimpleITK as sitk
@@ -29,7 +31,8 @@ def dense_findings(
     organ: trimesh.Trimesh,
     corrections: sitk.Image | None = None,
 ) -> tuple[tuple[str, ...], str]:
-    """Return warnings of the dense pieces of a kidney, which say how they are shown, and a note of its contrast phase.
+    """Return warnings of the dense pieces of a kidney, which say how they are shown, and a note of its
+    contrast phase.
 
     Args:
         grid: of ``hounsfield`` [HU] and ``coded`` (z, y, x), the tissue codes by labels; 0 without.
@@ -70,13 +73,17 @@ def dense_findings(
                 warnings.append(f"{ml:.1f} ml in the kidney are {what} ({kidney}), {where}: shown as {shown}")
     phase = "unenhanced" if not is_enhanced else "enhanced" if agent_ml < LEAST_ML else "excretory"
     return tuple(warnings), (
-        f"contrast phase: {phase}, as the kidney has a median of {level_hu:.0f} HU (with contrast agent more than {ENHANCED_FROM_HU:g})"
-        + f", and its collecting system {agent_ml:.1f} ml of contrast agent" * (phase == "excretory")
+        f"contrast phase: {phase}, as the kidney has a median of {level_hu:.0f} HU (with contrast agent "
+        f"more than {ENHANCED_FROM_HU:g})"
+        + f", and its collecting system {agent_ml:.1f} ml of contrast agent"
+        * (phase == "excretory")
     )
 
 
 def _has_dense(hu: np.ndarray, kidney: np.ndarray, above_hu: float, spacing_mm: np.ndarray) -> bool:
-    """Return whether there is anything dense in a kidney (nx, ny, nz) and its hollows, or next to them: few have any."""
+    """Return whether there is anything dense in a kidney (nx, ny, nz) and its hollows, or next to them:
+    few have any.
+    """
     if not kidney.any():
         return False
     box = tuple(
@@ -95,7 +102,9 @@ def _sampled(image: sitk.Image, grid: VoxelGrid) -> np.ndarray:
 
 
 def _without_touching(mask: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the pieces of a mask that do not touch another: the rim of labelled contrast agent is as bright by partial volume."""
+    """Return the pieces of a mask that do not touch another: the rim of labelled contrast agent is as
+    bright by partial volume.
+    """
     pieces, _ = ndimage.label(mask, np.ones((3, 3, 3)))
     touching = np.unique(pieces[ndimage.binary_dilation(other, np.ones((3, 3, 3)))])
     return mask & ~np.isin(pieces, touching)
@@ -108,4 +117,7 @@ def _largest_piece(grid: VoxelGrid, mask: np.ndarray, organ: trimesh.Trimesh) ->
     x, y, z = grid.place(np.argwhere(piece)).mean(axis=0)
     low, high = organ.bounds[:, 2]
     third = ("lower", "middle", "upper")[int(np.clip(3 * (z - low) / (high - low), 0, 2))]
-    return f"the largest piece {piece.sum() * grid.voxel_ml:.1f} ml in the {third} third, at {x:.0f}, {y:.0f}, {z:.0f} mm (LPS)"
+    return (
+        f"the largest piece {piece.sum() * grid.voxel_ml:.1f} ml in the {third} third, at {x:.0f}, "
+        f"{y:.0f}, {z:.0f} mm (LPS)"
+    )

@@ -57,7 +57,8 @@ PROBE_FILE = "probe.toml"
     "--support",
     default="mould",
     show_default=True,
-    help="What the organ rests on: a mould of its underside, a bed made from the labels around it (labels), or a surface in a "
+    help="What the organ rests on: a mould of its underside, a bed made from the labels around it "
+    "(labels), or a surface in a "
     "file (LPS, mm).",
 )
 @click.option(
@@ -68,7 +69,8 @@ PROBE_FILE = "probe.toml"
 @click.option(
     "--space",
     type=click.Choice(SPACES, case_sensitive=False),
-    help="Where +x, +y and +z point in files that do not name it, such as RAS: to the patient's right, front (anterior) and head "
+    help="Where +x, +y and +z point in files that do not name it, such as RAS: to the patient's right, "
+    "front (anterior) and head "
     "(superior).",
 )
 @click.option(
@@ -105,8 +107,9 @@ def import_patient_command(
 
     The folder contains the scene to rehearse.
 
-    CT: a folder with DICOM, a DICOMDIR or zip archive, a NIfTI, NRRD or MHA file. LABELS: label maps, surfaces (STL,
-    PLY, OBJ), a folder with one file per organ, DICOM-SEG, RTSTRUCT; by default the segmentation in the CT's folder.
+    CT: a folder with DICOM, a DICOMDIR or zip archive, a NIfTI, NRRD or MHA file. LABELS: label maps,
+    surfaces (STL, PLY, OBJ), a folder with one file per organ, DICOM-SEG, RTSTRUCT; by default the
+    segmentation in the CT's folder.
     """
     if lists:
         from scenes.patients.import_listing import listing_text
@@ -149,7 +152,8 @@ def import_patient_command(
     if (written.notes, written.warnings) != (patient.notes, patient.warnings):
         click.echo("Names of labels that may be a person's are shown here, and are not in the files.")
     click.echo(
-        f"The probe is {probe}, on the organ over the {'middle' if patient.tumour is None else 'tumour'}; --probe gives another.\n"
+        f"The probe is {probe}, on the organ over the "
+        f"{'middle' if patient.tumour is None else 'tumour'}; --probe gives another.\n"
         f"Written to {out}. Check {out / 'check.png'}, then: {shell_command('rehearse', out)}"
     )
 

@@ -25,7 +25,8 @@ AS_THEY_ARE = VoxelGrid((1, 1, 1), np.ones(3), np.zeros(3), np.eye(3))
 def listing_text(
     ct: Path, labels: Sequence[Path] = (), progress: Progress = silent, space: Space | None = None
 ) -> str:
-    """CT series and labels as tables: without any name, ID or date of the patient, but with the names of files and labels.
+    """CT series and labels as tables: without any name, ID or date of the patient, but with the names of
+    files and labels.
 
     Raises PatientError: a path that cannot be read.
     """
@@ -33,7 +34,8 @@ def listing_text(
     faults = [f"series {_name(row)} cannot be imported: {row.fault}" for row in listed.series if row.fault]
     if listed.unreadable:
         faults.append(
-            f"{listed.unreadable} subfolders cannot be read: series may be incomplete; check their permissions"
+            f"{listed.unreadable} subfolders cannot be read: series may be incomplete; check their "
+            "permissions"
         )
     parts = [_series_table(listed), "\n".join(faults), _labels_table(listed.labels)]
     parts += [_labels_text(path, progress, space) for path in labels]
@@ -76,7 +78,9 @@ def _labels_table(rows: list[LabelsRow]) -> str:
 
 
 def _labels_text(path: Path, progress: Progress, space: Space | None) -> str:
-    """The labels of one path: their segments with volumes; of DICOM, which needs its CT for that, the names."""
+    """The labels of one path: their segments with volumes; of DICOM, which needs its CT for that, the
+    names.
+    """
     if of_dicom := _dicom_labels(path, progress):
         return of_dicom
     maps = open_labels(path, progress=progress, space=space).maps(AS_THEY_ARE)

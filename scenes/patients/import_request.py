@@ -79,7 +79,8 @@ def import_request(
         segmentations = [each for each in segmentations if not each.is_class_image]
         if not segmentations:
             raise PatientError(
-                "the labels are a class image alone, which corrects tissues and has no organ; give the kidney's labels beside it"
+                "the labels are a class image alone, which corrects tissues and has no organ; give the "
+                "kidney's labels beside it"
             )
         volume = volume_of_labels(ct, segmentations, series, progress, contents, space)
         of_organ = organ_labels(segmentations, volume, organ, tissues)
@@ -95,7 +96,8 @@ def import_request(
         of_organ, classes = OrganLabels(draft_segmentation(volume, seed_mm)), []
     if space is not None and not assumed:
         raise PatientError(
-            f"--space {space}: every file states where its axes point; leave --space out, or correct the file that states it wrongly"
+            f"--space {space}: every file states where its axes point; leave --space out, or correct the "
+            "file that states it wrongly"
         )
     patient = import_patient(
         volume,
@@ -124,7 +126,10 @@ def organ_labels(
     organ: Sequence[str],
     tissues: Mapping[str, Sequence[str]],
 ) -> OrganLabels:
-    """The labels of all sources on a CT, with the tissues that the user assigned by names or values. Raises PatientError."""
+    """The labels of all sources on a CT, with the tissues that the user assigned by names or values.
+
+    Raises PatientError.
+    """
     maps = [one for segmentation in segmentations for one in segmentation.maps(volume.grid)]
     empty = [segment for segmentation in segmentations for segment in segmentation.empty]
     organ = with_commas(organ, maps, empty)
@@ -175,7 +180,8 @@ def _segmentations(
     found = segmentation_of(contents, words, progress, belongs) if contents else None
     if found is None:
         raise PatientError(
-            f"{ct}: no labels are with this CT; give a file or folder with LABELS, or --seed X,Y,Z for a draft"
+            f"{ct}: no labels are with this CT; give a file or folder with LABELS, or --seed X,Y,Z for a "
+            "draft"
         )
     return [found]
 
@@ -196,7 +202,8 @@ def volume_of_labels(
         fault = mismatch(segmentation.references, volume.references)
         if fault:
             raise PatientError(
-                f"{ct}: the labels {fault} this CT series; expected the CT that they were drawn on; choose it with --series, or give "
+                f"{ct}: the labels {fault} this CT series; expected the CT that they were drawn on; choose "
+                "it with --series, or give "
                 "its folder"
             )
     found = [note for s in segmentations for note in doubts(s.references, volume.references)]

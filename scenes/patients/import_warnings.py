@@ -14,7 +14,8 @@ from scenes.volumes.voxel_grid import VoxelGrid
 SHELL_MM, FAT_BELOW_HU, MOST_FAT = 4.0, -60, 0.05
 # Tissues that are in a kidney, or at its hilum.
 OF_KIDNEY = (*PARENCHYMA, *LESIONS, *HILAR)
-# A segment touches an organ that is so many voxels away, and is in it with this share; beside it, less volume gives no warning.
+# A segment touches an organ that is so many voxels away, and is in it with this share; beside it, less volume
+# gives no warning.
 REACH, LEAST_WITHIN, LEAST_BESIDE_ML = 2, 0.5, 0.5
 # What is larger than this share of the organ is around it, as its fascia.
 MOST_WITHIN = 0.5
@@ -24,10 +25,11 @@ MOST_PLACES = 100_000
 def fat_warnings(
     grid: VoxelGrid, hounsfield: np.ndarray, organ: np.ndarray, parenchyma: np.ndarray, slice_mm: float
 ) -> tuple[str, ...]:
-    """A warning where much of an organ's outer shell is fat or gas: its label is shifted, mirrored or of another CT.
+    """A warning where much of an organ's outer shell is fat or gas: its label is shifted, mirrored or of
+    another CT.
 
-    Of the organ (z, y, x) only the parenchyma counts: a tumour may contain fat. A label whose slices are ``slice_mm`` apart ends in steps of
-    that height.
+    Of the organ (z, y, x) only the parenchyma counts: a tumour may contain fat. A label whose slices are
+    ``slice_mm`` apart ends in steps of that height.
     """
     # A voxel beyond the organ's box is farther than one at its side.
     box = tuple(slice(max(0, a.start - 1), a.stop + 1) for a in box_of(organ)[::-1]) if organ.any() else ()
@@ -38,7 +40,8 @@ def fat_warnings(
     if share <= MOST_FAT:
         return ()
     return (
-        f"{share:.0%} of the organ's rim is fat or gas in the CT; the labels may be shifted, mirrored or of another CT; "
+        f"{share:.0%} of the organ's rim is fat or gas in the CT; the labels may be shifted, mirrored or "
+        "of another CT; "
         "compare the outlines in check.png",
     )
 
@@ -46,7 +49,8 @@ def fat_warnings(
 def label_warnings(
     labels: LabelMap, piece: Organ, is_named: bool, drawn: Sequence[LabelMap]
 ) -> tuple[str, ...]:
-    """Warnings of labels without a known tissue: taken as the organ, or left out though they are in it or touch it.
+    """Warnings of labels without a known tissue: taken as the organ, or left out though they are in it or
+    touch it.
 
     Args:
         labels: of the organ.
@@ -59,7 +63,8 @@ def label_warnings(
     if not is_named and len(unnamed) > 1:
         names = listed([str(labels.segments[value]) for value in unnamed])
         found.append(
-            f"labels {names} have no names, and were all taken as the kidney; if they are not, give --organ, --tumour, --cyst"
+            f"labels {names} have no names, and were all taken as the kidney; if they are not, give --organ, "
+            "--tumour, --cyst"
         )
     taken = [labels.segments[value] for value in piece.present]
     filled = ndimage.binary_fill_holes(np.pad(piece.mask, REACH))
@@ -72,7 +77,8 @@ def label_warnings(
 
 
 def _other_segment(one: LabelMap, value: int, piece: Organ, near: np.ndarray) -> list[str]:
-    """A warning of a segment that is no part of a kidney: in an organ, or, where its tissue is not known, beside it.
+    """A warning of a segment that is no part of a kidney: in an organ, or, where its tissue is not known,
+    beside it.
 
     ``near`` is the organ without hollows, dilated by REACH voxels.
     """
@@ -85,12 +91,14 @@ def _other_segment(one: LabelMap, value: int, piece: Organ, near: np.ndarray) ->
     if share >= LEAST_WITHIN and volume_ml < MOST_WITHIN * piece.volume_ml:
         known = "is of no tissue of a kidney" if segment.is_understood else "has no known tissue"
         return [
-            f"label {segment} ({volume_ml:.1f} ml) in the organ {known}, and is not shown, {_place(piece, places)}; {advice}"
+            f"label {segment} ({volume_ml:.1f} ml) in the organ {known}, and is not shown, "
+            f"{_place(piece, places)}; {advice}"
         ]
     if segment.is_understood or segment.tissue is not None or share == 0 or volume_ml < LEAST_BESIDE_ML:
         return []
     return [
-        f"label {segment} ({volume_ml:.1f} ml) touches the organ and has no known tissue, and was left out; {advice}"
+        f"label {segment} ({volume_ml:.1f} ml) touches the organ and has no known tissue, and was left "
+        f"out; {advice}"
     ]
 
 

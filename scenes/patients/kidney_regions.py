@@ -1,4 +1,6 @@
-"""Regions of a CT that may be a kidney, and how much each is like one: convex, with an edge in HU along its surface."""
+"""Regions of a CT that may be a kidney, and how much each is like one: convex, with an edge in HU along
+its surface.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +13,11 @@ from scipy.spatial import ConvexHull
 from scenes.patients.readers.label_maps import box_of
 
 FAT_HU = -100.0
-# A surface point is on an edge where the HU one or two voxels outside differ by this share of the region's contrast to fat. Of a kidney
-# of 150 HU, a liver of 110 HU differs by 0.16.
+# A surface point is on an edge where the HU one or two voxels outside differ by this share of the region's
+# contrast to fat. Of a kidney of 150 HU, a liver of 110 HU differs by 0.16.
 EDGE_SHARE = 0.15
-# Of the CTs used in development, kidneys have at least 0.87 and 0.68; spleen, stomach, muscle and vertebra at most 0.83 of
-# the first; spleen and kidney in one region at most 0.83 of the first, or 0.61 of the second.
+# Of the CTs used in development, kidneys have at least 0.87 and 0.68; spleen, stomach, muscle and vertebra at
+# most 0.83 of the first; spleen and kidney in one region at most 0.83 of the first, or 0.61 of the second.
 LEAST_EDGE, LEAST_SOLIDITY = 0.85, 0.65
 
 

@@ -18,7 +18,8 @@ CLEARLY_MM = 30.0
 def island_warnings(
     labels: LabelMap, own: Sequence[int], pieces: Sequence[Organ], chosen: Organ
 ) -> tuple[str, ...]:
-    """Warnings of islands of an organ's labels, its tumours and cysts that may be those of the chosen one of all pieces.
+    """Warnings of islands of an organ's labels, its tumours and cysts that may be those of the chosen one of
+    all pieces.
 
     ``own`` are the organ's values.
     """
@@ -54,7 +55,8 @@ def _islands(
         if distance <= nearest + CLEARLY_MM:
             x, y, z = places.mean(axis=0)
             warnings.append(
-                f"{volumes[n]:.1f} ml of the {name}'s label touch no labelled kidney, {distance:.0f} mm from this one at {x:.0f}, {y:.0f}, "
+                f"{volumes[n]:.1f} ml of the {name}'s label touch no labelled kidney, {distance:.0f} mm from "
+                f"this one at {x:.0f}, {y:.0f}, "
                 f"{z:.0f} mm (LPS), and were left out; compare the labels with the CT"
             )
     return warnings

@@ -1,7 +1,8 @@
-"""Whether labels fit their CT better elsewhere: a rigid shift of some millimetres, as from a wrong origin or slice.
+"""Whether labels fit their CT better elsewhere: a rigid shift of some millimetres, as from a wrong origin or
+slice.
 
-The outline of an organ is compared with the edges of the CT by normalised gradient fields (Haber and Modersitzki 2006), at all
-shifts of a lattice.
+The outline of an organ is compared with the edges of the CT by normalised gradient fields (Haber and
+Modersitzki 2006), at all shifts of a lattice.
 """
 
 from dataclasses import replace
@@ -38,13 +39,16 @@ def shift_warnings(
         return ()
     ways = [f"{mm:.0f} mm {words}" for mm, words in components(shift)]
     return (
-        f"the labels fit the CT better when moved by {' and '.join(ways)}; they may be shifted, or of another series; compare the "
+        f"the labels fit the CT better when moved by {' and '.join(ways)}; they may be shifted, or of "
+        "another series; compare the "
         "outlines in check.png, and export CT and labels again",
     )
 
 
 def best_shift(grid: VoxelGrid, hounsfield: np.ndarray, label: VoxelGrid, organ: np.ndarray) -> np.ndarray:
-    """The shift (3,) LPS [mm] of an organ with the best fit to the CT; zero where none is clearly better than none."""
+    """The shift (3,) LPS [mm] of an organ with the best fit to the CT; zero where none is clearly better
+    than none.
+    """
     lattice = _lattice(grid, label)
     tissue = lattice.sampled(grid.image(hounsfield), sitk.sitkLinear, FAT_HU).astype(np.float32)
     shape = lattice.sampled(label.image(organ.astype(np.float32)), sitk.sitkLinear, 0.0)
@@ -76,7 +80,8 @@ def _gradient(values: np.ndarray) -> np.ndarray:
 def _edges(tissue: np.ndarray, organ: np.ndarray) -> np.ndarray:
     """Gradients (3, z, y, x) of the CT, of length 1 at clear edges.
 
-    HU are clipped to those of fat and organ: what is brighter than the organ, such as bone, has no edge to it.
+    HU are clipped to those of fat and organ: what is brighter than the organ, such as bone, has no edge to
+    it.
     """
     level = float(np.median(tissue[organ])) if organ.any() else 0.0
     gradient = _gradient(np.clip((tissue - FAT_HU) / max(level - FAT_HU, 1.0), 0.0, 1.0))
@@ -84,7 +89,9 @@ def _edges(tissue: np.ndarray, organ: np.ndarray) -> np.ndarray:
 
 
 def _correlation(edges: np.ndarray, outline: np.ndarray) -> np.ndarray:
-    """Sums of the products of two vector fields (3, z, y, x), the second shifted by -STEPS to STEPS along each axis."""
+    """Sums of the products of two vector fields (3, z, y, x), the second shifted by -STEPS to STEPS along
+    each axis.
+    """
     # Zeros beyond the lattice: no shift brings in the other end.
     size = [n + STEPS for n in outline.shape[1:]]
     one, two = (np.fft.rfftn(field, size, axes=(1, 2, 3)) for field in (edges, outline))
@@ -93,7 +100,9 @@ def _correlation(edges: np.ndarray, outline: np.ndarray) -> np.ndarray:
 
 
 def _peak(fit: np.ndarray, best: np.ndarray) -> np.ndarray:
-    """Where the parabolas through an inner maximum and its neighbours are highest, as an index with fractions."""
+    """Where the parabolas through an inner maximum and its neighbours are highest, as an index with
+    fractions.
+    """
     peak = best.astype(float)
     for axis in range(3):
         below, at, above = fit[(*best[:axis], slice(best[axis] - 1, best[axis] + 2), *best[axis + 1 :])]

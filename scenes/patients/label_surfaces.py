@@ -18,8 +18,8 @@ FACES = 5000
 SMOOTHING_ITERATIONS = 20
 # The contouring grid: cells along the edge of a cube of the body's volume, and limits of the cell size [mm].
 CELLS, CELL_MM = 40, (0.3, 1.0)
-# Standard deviation, in voxels, of the low-pass filter on the signed distance. A label's boundary is known to half a
-# voxel, so terraces of that size are not anatomy; the HC filter alone preserves them.
+# Standard deviation, in voxels, of the low-pass filter on the signed distance. A label's boundary is known to
+# half a voxel, so terraces of that size are not anatomy; the HC filter alone preserves them.
 TERRACE_SD = 0.7
 
 
@@ -63,8 +63,9 @@ def surface_from_mask(mask: sitk.Image, faces: int = FACES) -> trimesh.Trimesh:
 def _largest_solid(mask: sitk.Image) -> tuple[np.ndarray, np.ndarray]:
     """Largest face-connected body, holes filled, cropped; axes (x, y, z) and index of its first voxel.
 
-    Islands would become loose bodies. Internal holes (a cyst, a stone or sinus fat that the label leaves out) would be
-    closed surfaces inside the tissue, where contact, sampling and skinning have no meaning; the model fills them.
+    Islands would become loose bodies. Internal holes (a cyst, a stone or sinus fat that the label leaves out)
+    would be closed surfaces inside the tissue, where contact, sampling and skinning have no meaning; the
+    model fills them.
     """
     voxels = sitk.GetArrayViewFromImage(mask).transpose(2, 1, 0) != 0
     if not voxels.any():
@@ -111,7 +112,8 @@ def _iso_surface(solid: np.ndarray, spacing: np.ndarray, step: float) -> trimesh
 def _one_solid(levels: np.ndarray, clear_of_zero: float) -> np.ndarray:
     """Keep the largest region of negative levels, without cavities; no level nearer to zero than stated.
 
-    The low-pass filter may cut a thin bridge or close a cleft, and a level of exactly zero gives triangles of zero area.
+    The low-pass filter may cut a thin bridge or close a cleft, and a level of exactly zero gives triangles of
+    zero area.
     """
     labelled, count = ndimage.label(levels < 0)
     if count == 0:
@@ -123,8 +125,8 @@ def _one_solid(levels: np.ndarray, clear_of_zero: float) -> np.ndarray:
 def decimate(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
     """Quadric edge collapse (Garland and Heckbert 1997) to about `faces` triangles.
 
-    libigl, not fast_simplification, though it takes a second longer: it refuses collapses that break the manifold or
-    make the surface intersect itself.
+    libigl, not fast_simplification, though it takes a second longer: it refuses collapses that break the
+    manifold or make the surface intersect itself.
     """
     if len(surface.faces) <= faces:
         return surface
@@ -135,10 +137,11 @@ def decimate(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
 
 
 def _even_triangles(coarse: trimesh.Trimesh, fine: trimesh.Trimesh, iterations: int = 8) -> trimesh.Trimesh:
-    """Move the vertices along the fine surface towards the mean of their neighbours (tangential Laplacian smoothing).
+    """Move the vertices along the fine surface towards the mean of their neighbours (tangential Laplacian
+    smoothing).
 
-    Edge collapse leaves needles, which have poor contact normals and skinning weights. Connectivity and shape are kept:
-    each iteration projects onto the fine surface.
+    Edge collapse leaves needles, which have poor contact normals and skinning weights. Connectivity and shape
+    are kept: each iteration projects onto the fine surface.
     """
     neighbours = trimesh.smoothing.laplacian_calculation(coarse)
     vertices = coarse.vertices.view(np.ndarray)
@@ -152,8 +155,8 @@ def _even_triangles(coarse: trimesh.Trimesh, fine: trimesh.Trimesh, iterations: 
 def _match_volume(surface: trimesh.Trimesh, volume: float) -> trimesh.Trimesh:
     """The surface with its vertices offset along their normals until it encloses `volume` [mm^3].
 
-    dV = A * offset to first order, so three Newton steps suffice; the offset is what smoothing and chords removed, about
-    0.1 mm.
+    dV = A * offset to first order, so three Newton steps suffice; the offset is what smoothing and chords
+    removed, about 0.1 mm.
     """
     matched = surface.copy()
     for _ in range(3):

@@ -1,4 +1,6 @@
-"""Slices of a label that nobody segmented: found between their neighbours and filled by shape-based interpolation (Raya and Udupa 1990)."""
+"""Slices of a label that nobody segmented: found between their neighbours and filled by shape-based
+interpolation (Raya and Udupa 1990).
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -9,15 +11,16 @@ from scipy import ndimage
 
 from scenes.patients.readers.label_maps import LESIONS, LabelMap, among, box_of, listed
 
-# So many neighbouring slices are filled, if they are no thicker than this together; of a tumour or cyst, where the kidney is labelled in them, fewer:
-# two tumours may be two slices apart.
+# So many neighbouring slices are filled, if they are no thicker than this together; of a tumour or cyst,
+# where the kidney is labelled in them, fewer: two tumours may be two slices apart.
 MOST_SLICES, MOST_LESION_SLICES, MOST_MM = 6, 1, 20.0
 # A section that both neighbours have is missing where this share of it has no label.
 LEAST_MISSING = 0.9
 # Less area may be the end of a lobe.
 LEAST_MM2, LEAST_LESION_MM2 = 100.0, 20.0
-# Two bodies end at a gap of several slices where both grow away from it: the product of the sections' shares of the largest. At the waist of a
-# kidney it is 0.5 or more, between two balls or their caps of up to half a radius 0.4 at most.
+# Two bodies end at a gap of several slices where both grow away from it: the product of the sections' shares
+# of the largest. At the waist of a kidney it is 0.5 or more, between two balls or their caps of up to half a
+# radius 0.4 at most.
 TWO_BODIES = 0.45
 # Gaps are searched in every second pixel of every second row.
 STRIDE = 2
@@ -59,7 +62,8 @@ def fill_missing_slices(labels: LabelMap, organ: list[int]) -> tuple[LabelMap, t
         if slices:
             labels = replace(labels, values=voxels)
             warnings.append(
-                f"no {structure.name} is labelled in the slice{'s' * (len(slices) > 1)} {listed(slices)}, and it is on both sides: it was "
+                f"no {structure.name} is labelled in the slice{'s' * (len(slices) > 1)} {listed(slices)}, "
+                "and it is on both sides: it was "
                 "interpolated there; correct the label if that is wrong"
             )
     return labels, tuple(warnings)
@@ -106,7 +110,9 @@ def _wider(a: slice) -> slice:
 
 
 def _share_of_largest(side: np.ndarray) -> float:
-    """The area of the first of some slices (n, y, x), as a share of the largest in the body that begins there."""
+    """The area of the first of some slices (n, y, x), as a share of the largest in the body that begins
+    there.
+    """
     areas = np.count_nonzero(side, axis=(1, 2))
     return float(areas[0] / areas[: int(np.argmin(areas > 0)) or None].max())
 
@@ -119,7 +125,8 @@ def _organ_values_between(before: np.ndarray, after: np.ndarray, structure: _Str
 
 
 def _gaps(inside: np.ndarray, known: np.ndarray, most: int, least: float) -> Iterator[tuple[int, int]]:
-    """First slice, and the one after the last, of gaps that may be missing: much is labelled on both sides and not between them.
+    """First slice, and the one after the last, of gaps that may be missing: much is labelled on both sides
+    and not between them.
 
     Args:
         inside: the structure, slices along the first axis.
@@ -139,7 +146,9 @@ def _gaps(inside: np.ndarray, known: np.ndarray, most: int, least: float) -> Ite
 
 
 def _sections(slices: np.ndarray, structure: _Structure, pixel: np.ndarray) -> list[np.ndarray]:
-    """The missing sections of all slices but the first and last, between which they are interpolated, as masks."""
+    """The missing sections of all slices but the first and last, between which they are interpolated, as
+    masks.
+    """
     ends = [np.isin(end, structure.own) for end in (slices[0], slices[-1])]
     itself = [np.isin(end, structure.itself) for end in (slices[0], slices[-1])]
     between = slices[1:-1]

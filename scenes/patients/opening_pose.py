@@ -1,4 +1,6 @@
-"""Where the probe of an imported patient starts: over the tumour's middle, or the kidney's, where its face meets the organ best."""
+"""Where the probe of an imported patient starts: over the tumour's middle, or the kidney's, where its face
+meets the organ best.
+"""
 
 import numpy as np
 import trimesh
@@ -12,8 +14,8 @@ DIRECTIONS, MOST_TILT_DEG = 300, 60.0
 SQUARE_MM = 4.0
 # What of the face is beside the organ counts as a gap of this length.
 BESIDE_MM = 10.0
-# A gap of 1 mm under the face, on average, counts as much as so many mm more between face and target; so does each mm that the face
-# is in a concavity, as at the hilum, where an instrument with its vessels has no room.
+# A gap of 1 mm under the face, on average, counts as much as so many mm more between face and target; so does
+# each mm that the face is in a concavity, as at the hilum, where an instrument with its vessels has no room.
 GAP_WEIGHT = 3.0
 # Each degree from above counts as so many mm: the instruments come from the front.
 TILT_MM_DEG = 0.1
@@ -29,14 +31,16 @@ def opening_press(
     gravity: tuple[float, float, float],
     housing_mm: tuple[float, float, float],
 ) -> Press:
-    """The press that begins over the middle of the tumour, without one of the organ, from the side that can be reached.
+    """The press that begins over the middle of the tumour, without one of the organ, from the side that can
+    be reached.
 
     Args:
         organ: closed surface [mm], LPS, with its tumours.
         tumour: its tumour, if there is one.
         support: what the organ rests on.
         gravity: its direction.
-        housing_mm: the probe's, lateral x elevation x length; the lateral axis is along the organ's long axis.
+        housing_mm: the probe's, lateral x elevation x length; the lateral axis is along the organ's long
+        axis.
     """
     middle = (organ if tumour is None else tumour).center_mass
     long_axis = np.linalg.svd(organ.vertices - organ.vertices.mean(axis=0), full_matrices=False)[2][0]
@@ -74,7 +78,9 @@ def _axes_of(outward: np.ndarray, long_axis: np.ndarray) -> np.ndarray:
 
 
 def _touching(surface: np.ndarray, half_mm: np.ndarray) -> tuple[float, float]:
-    """Height [mm] of a face that touches a surface, points (n, 3) on the face's axes, and its mean distance [mm] from the surface below."""
+    """Height [mm] of a face that touches a surface, points (n, 3) on the face's axes, and its mean
+    distance [mm] from the surface below.
+    """
     counts = np.maximum(np.rint(2 * half_mm / SQUARE_MM).astype(int), 1)
     square = np.floor((surface[:, :2] / half_mm + 1) / 2 * counts).astype(int)
     under = ((square >= 0) & (square < counts)).all(axis=1)
@@ -89,7 +95,9 @@ def _touching(surface: np.ndarray, half_mm: np.ndarray) -> tuple[float, float]:
 def _is_under(
     support: trimesh.Trimesh, middle: np.ndarray, axes: np.ndarray, half_mm: np.ndarray, face_mm: float
 ) -> bool:
-    """Whether the support is in the place of the probe, whose face has a height along the axes (3, 3) through the middle (3,)."""
+    """Whether the support is in the place of the probe, whose face has a height along the axes (3, 3)
+    through the middle (3,).
+    """
     at = (support.vertices - middle) @ axes
     beside = (np.abs(at[:, :2]) > half_mm + CLEARANCE_MM).any(axis=1)
     return bool((~beside & (at[:, 2] > face_mm)).any())

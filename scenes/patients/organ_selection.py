@@ -49,11 +49,13 @@ class Organ:
 def find_organs(labels: LabelMap, organ: Sequence[int] | None = None) -> list[Organ]:
     """Large connected pieces of organ, tumours and cysts, from right to left.
 
-    Islands, and tumours apart from every kidney, are left out. Labels that touch are one piece, such as cortex and medulla.
+    Islands, and tumours apart from every kidney, are left out. Labels that touch are one piece, such as
+    cortex and medulla.
 
     Args:
         labels: tumours and cysts are recognised by their tissue.
-        organ: label values of the organ; None: those named as a kidney, or without names all but tumours, cysts and vessels.
+        organ: label values of the organ; None: those named as a kidney, or without names all but tumours,
+        cysts and vessels.
 
     Raises:
         PatientError: no label is an organ.
@@ -75,7 +77,8 @@ def find_organs(labels: LabelMap, organ: Sequence[int] | None = None) -> list[Or
 
 
 def _with_touching(parts: np.ndarray, n: int, of_organ: list[int]) -> np.ndarray:
-    """Part n, with tumours and cysts that touch it only at edges or corners, and the voxels that connect them by faces.
+    """Part n, with tumours and cysts that touch it only at edges or corners, and the voxels that connect them
+    by faces.
 
     Without a common face they would not be in one surface.
     """
@@ -89,13 +92,16 @@ def _with_touching(parts: np.ndarray, n: int, of_organ: list[int]) -> np.ndarray
 
 
 def organ_values(labels: LabelMap, organ: Sequence[int] | None) -> list[int]:
-    """Label values of the organ: the user's, those named as a kidney, or without names all that are no other tissue. Raises PatientError."""
+    """Label values of the organ: the user's, those named as a kidney, or without names all that are no
+    other tissue. Raises PatientError.
+    """
     if organ is not None:
         # Tumours and cysts are lesions wherever they are given: apart from every kidney they are no organ.
         own = [value for value in organ if labels.segments[value].tissue not in LESIONS]
         if not own:
             raise PatientError(
-                "the organ's labels are only those of tumours and cysts; give the kidney's own with --organ, too"
+                "the organ's labels are only those of tumours and cysts; give the kidney's own with --organ, "
+                "too"
             )
         return own
     named = any(segment.name or segment.tissue for segment in labels.segments.values())
@@ -160,7 +166,8 @@ def midline_x(grid: VoxelGrid, hounsfield: np.ndarray, low_z_mm: float, high_z_m
 
 
 def choose_organ(pieces: list[Organ], midline: float | None, side: Side | None) -> tuple[Organ, Side]:
-    """The organ on the requested side; where the CT shows no body, ``side`` or the label's name replaces the midline.
+    """The organ on the requested side; where the CT shows no body, ``side`` or the label's name replaces the
+    midline.
 
     Raises PatientError: none, several, or a name of the other side.
     """
@@ -183,13 +190,15 @@ def choose_organ(pieces: list[Organ], midline: float | None, side: Side | None) 
         advice = "--side left or --side right, or --organ with" if split else "--organ with"
         where = f" on the {side}" if side and midline is not None else ""
         raise PatientError(
-            f"{len(chosen)} organs are labelled{where}, expected one, found: {found}; give {advice} the label of one; labels that "
+            f"{len(chosen)} organs are labelled{where}, expected one, found: {found}; give {advice} the "
+            "label of one; labels that "
             "touch are taken together, and a label in two pieces has an empty slice"
         )
     actual: Side = chosen[0].side_of(midline)
     if chosen[0].named_sides == {"right" if actual == "left" else "left"}:
         raise PatientError(
-            f"{chosen[0].title} is on the patient's {actual}, but its name has the other side; expected both to agree; the labels or "
+            f"{chosen[0].title} is on the patient's {actual}, but its name has the other side; expected both "
+            "to agree; the labels or "
             "the CT may be mirrored: check the export"
         )
     return chosen[0], actual

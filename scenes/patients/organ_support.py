@@ -1,8 +1,10 @@
-"""What the organ rests on: a mould of its underside, a bed made from the labels around it, or a surface file of the user.
+"""What the organ rests on: a mould of its underside, a bed made from the labels around it, or a surface file
+of the user.
 
-The mould is the paper's: Camara et al. 2016 laid the kidney phantom in plasticine; the virtual bead experiments describe it as
-the lower 35 % of the organ's height, dilated by 0.3 mm and swept upwards, taken out of a block; its rim is filleted. The bed is
-the labelled tissue under the organ and the fat between, carved in the same manner.
+The mould is the paper's: Camara et al. 2016 laid the kidney phantom in plasticine; the virtual bead
+experiments describe it as the lower 35 % of the organ's height, dilated by 0.3 mm and swept upwards, taken
+out of a block; its rim is filleted. The bed is the labelled tissue under the organ and the fat between,
+carved in the same manner.
 """
 
 from pathlib import Path
@@ -26,11 +28,12 @@ CLEARANCE_MM = 0.3
 LEAST_CLEARANCE = 0.25
 ATTEMPTS = 4
 
-# The mould: share of the organ's height, along gravity, inside it; least width of the block around it; thickness under the
-# organ's lowest point; radius of the mould's rim and of the block's edges.
+# The mould: share of the organ's height, along gravity, inside it; least width of the block around it;
+# thickness under the organ's lowest point; radius of the mould's rim and of the block's edges.
 DEPTH, BLOCK_WALL_MM, FLOOR_MM, RIM_MM = 0.35, 12.0, 8.0, 4.0
 
-# Labelled tissue within this distance under the organ supports it; the fat between them becomes part of the bed.
+# Labelled tissue within this distance under the organ supports it; the fat between them becomes part of the
+# bed.
 REACH_MM = 40.0
 # The bed's margin around the organ, its height as a share of the organ's height, and the radius of its edges.
 WALL_MM, HEIGHT, FILLET_MM = 20.0, 0.5, 3.0
@@ -43,8 +46,9 @@ MOST_OVERLAP_MM = 0.5
 
 # Vertical rays through the organ, apart by this.
 RAYS_MM = 4.0
-# At the start the organ falls until about this share of its projected area lies on the support: on a flat one that touches it, real
-# kidneys of the development data fall by up to 2.7 mm. After 5 mm the organ arrives with 0.3 m/s, and hangs on its pedicle.
+# At the start the organ falls until about this share of its projected area lies on the support: on a flat one
+# that touches it, real kidneys of the development data fall by up to 2.7 mm. After 5 mm the organ arrives
+# with 0.3 m/s, and hangs on its pedicle.
 LANDS_ON, MOST_FALL_MM = 0.05, 5.0
 # The share of the organ's projected area that a support may have above it: the probe comes from there.
 MOST_COVERED = 0.1
@@ -120,7 +124,8 @@ def bed_of_labels(
     share = np.count_nonzero(under.any(axis=2)) / np.count_nonzero(swept.any(axis=2))
     if share < LEAST_UNDER:
         raise PatientError(
-            f"labelled tissue supports {share:.0%} of the organ: expected {LEAST_UNDER:.0%} or more for a bed; label more of "
+            f"labelled tissue supports {share:.0%} of the organ: expected {LEAST_UNDER:.0%} or more for a "
+            "bed; label more of "
             "the tissue under it, or leave --support out for a mould"
         )
     bed = (tissue & (gap > 0)) | under
@@ -172,18 +177,21 @@ def _check_under(path: Path, bed: trimesh.Trimesh, organ: trimesh.Trimesh, gravi
     along = f"along gravity, which is ({x:g}, {y:g}, {z:g}) in LPS"
     if share < LEAST_UNDER:
         raise PatientError(
-            f"{path}: is under {share:.0%} of the organ and above {above:.0%} of it, {along}; expected under {LEAST_UNDER:.0%} or "
+            f"{path}: is under {share:.0%} of the organ and above {above:.0%} of it, {along}; expected under "
+            f"{LEAST_UNDER:.0%} or "
             "more; move it under the organ, or leave --support out for a mould"
         )
     if above > MOST_COVERED:
         raise PatientError(
-            f"{path}: covers {above:.0%} of the organ from above, {along}; expected at most {MOST_COVERED:.0%}, as the probe comes "
+            f"{path}: covers {above:.0%} of the organ from above, {along}; expected at most "
+            f"{MOST_COVERED:.0%}, as the probe comes "
             "from there; cut off what is above the organ"
         )
     fall = float(np.sort(gaps)[int(LANDS_ON * len(gaps))])
     if fall > MOST_FALL_MM:
         raise PatientError(
-            f"{path}: is {fall:.1f} mm under the organ, {along}, so that the organ would fall on it; expected at most "
+            f"{path}: is {fall:.1f} mm under the organ, {along}, so that the organ would fall on it; "
+            "expected at most "
             f"{MOST_FALL_MM:g} mm; move it closer, fill the space between, or leave --support out for a mould"
         )
 
@@ -191,7 +199,8 @@ def _check_under(path: Path, bed: trimesh.Trimesh, organ: trimesh.Trimesh, gravi
 def vertical_gaps(
     bed: trimesh.Trimesh, organ: trimesh.Trimesh, gravity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of vertical rays through an organ: the gap [mm] from its underside to the bed, inf where there is none; and where the bed is above it.
+    """Of vertical rays through an organ: the gap [mm] from its underside to the bed, inf where there is none;
+    and where the bed is above it.
 
     Both have the shape (ray_count,); the rays are evenly spaced over the organ's projected area.
     """
@@ -262,8 +271,8 @@ def _grid_over(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, ...]:
 def _distance_to_swept(surface: trimesh.Trimesh, grid: tuple[np.ndarray, ...]) -> np.ndarray:
     """Distance [mm] from the grid's nodes to the organ swept upwards to infinity; negative inside.
 
-    The distance to a union is the minimum of the distances to its parts, and a copy of the organ raised by t is as far from
-    a point as the organ is from the point t lower: a running minimum along the upward axis.
+    The distance to a union is the minimum of the distances to its parts, and a copy of the organ raised by t
+    is as far from a point as the organ is from the point t lower: a running minimum along the upward axis.
     """
     low, counts = np.array([axis[0] for axis in grid]), tuple(len(axis) for axis in grid)
     return np.minimum.accumulate(distances_on_grid(surface, low, counts, GRID_MM), axis=2)
@@ -283,7 +292,8 @@ def _carved(
     fillet_mm: float,
     clearance_mm: float,
 ) -> trimesh.Trimesh:
-    """A solid (signed distance) less the swept organ, with a clearance to the organ at rest. Raises ValueError.
+    """A solid (signed distance) less the swept organ, with a clearance to the organ at rest. Raises
+    ValueError.
 
     Decimation moves the support towards the organ; the gap is increased until the clearance is met.
     """
@@ -300,8 +310,8 @@ def _carved(
 
 
 def _contour(level: np.ndarray, grid: tuple[np.ndarray, ...]) -> trimesh.Trimesh:
-    """Zero level on the grid, of about FACES triangles, normals outward: a solid that ends within its grid, without cavities and
-    specks.
+    """Zero level on the grid, of about FACES triangles, normals outward: a solid that ends within its grid,
+    without cavities and specks.
     """
     bounded = np.pad(level[1:-1, 1:-1, 1:-1], 1, constant_values=GRID_MM)
     parts, _ = ndimage.label(bounded < 0)

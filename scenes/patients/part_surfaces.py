@@ -21,7 +21,8 @@ from scenes.volumes.voxel_grid import VoxelGrid
 
 # Vessels and the collecting system are modelled up to this distance from the organ: its pedicle.
 PEDICLE_MM = 15.0
-# The number of faces is proportional to the area: a tumour is meshed as finely as a kidney of this area; branching parts, finer.
+# The number of faces is proportional to the area: a tumour is meshed as finely as a kidney of this area;
+# branching parts, finer.
 FACES, FACES_AT_MM2 = 5000, 17000.0
 LEAST_FACES = 500
 BRANCHING = 3.0
@@ -82,7 +83,8 @@ def parts_elsewhere(
 def part_surfaces_in_processes(
     found: PartMasks,
 ) -> Iterator[Callable[[Progress], dict[str, trimesh.Trimesh]]]:
-    """Start to make the surfaces of all parts, in processes where they are large; yield a function that waits for them.
+    """Start to make the surfaces of all parts, in processes where they are large; yield a function that waits
+    for them.
 
     Raises PatientError where a tumour or cyst has no surface.
     """
@@ -99,7 +101,8 @@ def part_surfaces_in_processes(
             yield lambda progress: _without_empty((t, made[t].result()) for t in progress(found, "surfaces"))
         except BrokenExecutor:
             raise PatientError(
-                "a process that made surfaces was ended, perhaps for lack of memory; close other programs and try again"
+                "a process that made surfaces was ended, perhaps for lack of memory; close other programs "
+                "and try again"
             ) from None
 
 
@@ -137,13 +140,17 @@ def _surface(mask: sitk.Image, name: str, faces: int) -> trimesh.Trimesh:
         grid, inside = VoxelGrid.of(mask), sitk.GetArrayViewFromImage(mask) != 0
         x, y, z = grid.place(np.argwhere(inside).mean(axis=0)[None, ::-1])[0]
         raise PatientError(
-            f"the {name} has no surface: {error}; its label has {inside.sum()} voxels, {inside.sum() * grid.voxel_ml:.2f} ml, there, around "
+            f"the {name} has no surface: {error}; its label has {inside.sum()} voxels, "
+            f"{inside.sum() * grid.voxel_ml:.2f} ml, there, around "
             f"{x:.0f}, {y:.0f}, {z:.0f} mm (LPS); remove them from the label, or draw it on smaller voxels"
         ) from error
 
 
 def part_surface(grid: VoxelGrid, inside: np.ndarray, tissue: str) -> trimesh.Trimesh | None:
-    """Surface of a part: all its bodies but specks in one mesh. None where a part other than a lesion is too thin."""
+    """Surface of a part: all its bodies but specks in one mesh.
+
+    None where a part other than a lesion is too thin.
+    """
     labelled, _ = ndimage.label(inside)
     sizes = np.bincount(labelled.ravel())[1:]
     finer = BRANCHING if tissue in HILAR else 1.0

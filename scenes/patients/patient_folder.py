@@ -1,4 +1,6 @@
-"""Write a patient's folder: voxels, surfaces and texts of the program's own words, so that nothing in it identifies the patient (PHI)."""
+"""Write a patient's folder: voxels, surfaces and texts of the program's own words, so that nothing in it
+identifies the patient (PHI).
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +22,8 @@ def save_patient(
     texts: dict[str, str] | None = None,
     draw: Callable[[Path], None] | None = None,
 ) -> None:
-    """Write ct.nrrd, labels.nrrd, corrections.nrrd if there are any, organ.stl, support.stl and a surface for each part: all or nothing.
+    """Write ct.nrrd, labels.nrrd, corrections.nrrd if there are any, organ.stl, support.stl and a surface for
+    each part: all or nothing.
 
     Args:
         patient: only its voxels and geometry are written.
@@ -54,7 +57,9 @@ def _write(patient: Patient, folder: Path, texts: dict[str, str]) -> None:
 
 
 def public(patient: Patient) -> Patient:
-    """The patient as its folder describes it: notes and warnings without names of labels that may be a person's."""
+    """The patient as its folder describes it: notes and warnings without names of labels that may be a
+    person's.
+    """
     return replace(
         patient,
         notes=tuple(map(public_text, patient.notes)),

@@ -1,6 +1,8 @@
-"""Patient import: from a CT and its labels to surfaces of an organ and its parts, a support, and the cropped CT.
+"""Patient import: from a CT and its labels to surfaces of an organ and its parts, a support, and the cropped
+CT.
 
-All coordinates are DICOM's: LPS [mm], +x to the patient's left, +y posterior, +z to the head. Voxels are cropped, and resampled only where a series is tilted or unevenly spaced.
+All coordinates are DICOM's: LPS [mm], +x to the patient's left, +y posterior, +z to the head. Voxels are
+cropped, and resampled only where a series is tilted or unevenly spaced.
 """
 
 from collections.abc import Collection, Sequence
@@ -115,14 +117,15 @@ def import_patient(
         ct: scalar volume [HU]; only the part around the organ is read.
         labels: on any grid; surfaces are made on it, and resampled to the CT's by nearest neighbour.
         organ: label values of the organ; None: those named as a kidney, or all that are nothing else.
-        side: which of two kidneys, or a check of the only one; needed where neither the CT nor the labels' names show the
+        side: which of two kidneys, or a check of the only one; needed where neither the CT nor the labels'
+        names show the
             side.
         margin_mm: CT kept around the organ [mm].
-        support: what the organ rests on: a "mould" of its underside, a bed of the surrounding "labels", or a surface file.
-        given: tissues whose labels the user named: a note tells which of them this organ does not have.
-        drawn: the label maps before they were merged: some segments may be covered in ``labels``; none: they are ``labels``.
-        position: how the patient lay in the CT; None: as in its header, else supine.
-        progress: shows the progress of the surfaces.
+        support: what the organ rests on: a "mould" of its underside, a bed of the surrounding "labels", or a
+        surface file. given: tissues whose labels the user named: a note tells which of them this organ does
+        not have. drawn: the label maps before they were merged: some segments may be covered in ``labels``;
+        none: they are ``labels``. position: how the patient lay in the CT; None: as in its header, else
+        supine. progress: shows the progress of the surfaces.
         classes: of class images, which correct the tissues around the organ and of its parts.
 
     Raises:
@@ -191,7 +194,9 @@ def import_patient(
 def _misplaced(
     piece: Organ, grid: VoxelGrid, hounsfield: np.ndarray, on_ct: np.ndarray, coded: np.ndarray
 ) -> tuple[str, ...]:
-    """Warnings of labels that are not where the CT shows the organ; ``on_ct`` and ``coded`` are on its grid."""
+    """Warnings of labels that are not where the CT shows the organ; ``on_ct`` and ``coded`` are on its
+    grid.
+    """
     # Fat in the rim of a label that is shifted by a few millimetres has the same cause.
     return shift_warnings(grid, hounsfield, piece.grid, piece.mask) or fat_warnings(
         grid, hounsfield, on_ct, coded == KIDNEY, float(piece.grid.spacing.max())
@@ -217,7 +222,8 @@ def _level(ct: LazyVolume, pieces: list[Organ], margin_mm: float) -> tuple[Box, 
     """The box of a CT at the level of all organs, and its HU: enough to find the midline and to crop."""
     if max(_overlap(ct.grid, piece) for piece in pieces) == 0:
         raise PatientError(
-            "the labels are outside the CT, with 0 % of the organ in it: expected both to overlap in patient coordinates; "
+            "the labels are outside the CT, with 0 % of the organ in it: expected both to overlap in patient "
+            "coordinates; "
             "choose labels that were drawn on this CT"
         )
     places = np.concatenate([piece.grid.corners() for piece in pieces])
@@ -228,7 +234,8 @@ def _level(ct: LazyVolume, pieces: list[Organ], margin_mm: float) -> tuple[Box, 
     darkest, brightest = int(hounsfield.min()), int(hounsfield.max())
     if darkest > FAT_HU or brightest - darkest < LEAST_SPAN_HU:
         raise PatientError(
-            f"the CT has values from {darkest} to {brightest}: expected HU, fat about -100 and air -1000; give the CT first, then the "
+            f"the CT has values from {darkest} to {brightest}: expected HU, fat about -100 and air -1000; "
+            "give the CT first, then the "
             "labels, and export it with its rescale and without normalising"
         )
     return box, hounsfield
@@ -251,13 +258,15 @@ def _check_complete(grid: VoxelGrid, piece: Organ) -> None:
     least, most = PLAUSIBLE_ORGAN_ML
     if not least <= piece.volume_ml <= most:
         raise PatientError(
-            f"{piece.title} has {piece.volume_ml:.1f} ml: expected {least:g} to {most:g} ml; choose the organ's "
+            f"{piece.title} has {piece.volume_ml:.1f} ml: expected {least:g} to {most:g} ml; choose the "
+            "organ's "
             "label values with --organ"
         )
     share = _overlap(grid, piece)
     if share < LEAST_OVERLAP:
         raise PatientError(
-            f"{piece.title} has {share:.0%} of its voxels in the CT: expected all of the organ; choose a CT that shows all of "
+            f"{piece.title} has {share:.0%} of its voxels in the CT: expected all of the organ; choose a CT "
+            "that shows all of "
             "it, or the labels that were drawn on this one"
         )
 
@@ -288,13 +297,15 @@ def _check_place(
         cut = max(ends, default=0) * np.prod(grid.spacing) / grid.spacing[axis]
         if cut > CUT_AREA_MM2:
             raise PatientError(
-                f"{piece.title} is cut off at the border of the CT over {cut / 100:.1f} cm2: expected a whole "
+                f"{piece.title} is cut off at the border of the CT over {cut / 100:.1f} cm2: expected a "
+                "whole "
                 "organ; choose a CT that shows all of it"
             )
     median = float(np.median(hounsfield[on_ct])) if on_ct.any() else 0.0
     if not PLAUSIBLE_ORGAN_HU[0] <= median <= PLAUSIBLE_ORGAN_HU[1]:
         raise PatientError(
-            f"{piece.title} has a median of {median:.0f} HU: expected soft tissue; check that the labels belong to "
+            f"{piece.title} has a median of {median:.0f} HU: expected soft tissue; check that the labels "
+            "belong to "
             "this CT and that the CT is in HU"
         )
 
@@ -304,13 +315,15 @@ def _check_surface(surface: trimesh.Trimesh, piece: Organ) -> None:
     found_ml = surface.volume / 1000
     if found_ml < (1 - MOST_VOLUME_OFF) * piece.volume_ml:
         raise PatientError(
-            f"{piece.title} has {piece.volume_ml:.1f} ml, and its surface encloses {found_ml:.1f}: expected all of it; parts of it "
+            f"{piece.title} has {piece.volume_ml:.1f} ml, and its surface encloses {found_ml:.1f}: expected "
+            "all of it; parts of it "
             "are connected by thin bridges; correct the label, or name the organ's own with --organ"
         )
 
 
 def _tissue_labels(labels: LabelMap, grid: VoxelGrid, on_ct: np.ndarray) -> tuple[np.ndarray, dict[int, str]]:
-    """Tissue codes (z, y, x) of the cropped CT and their tissues: parts of this organ, and all of other tissues.
+    """Tissue codes (z, y, x) of the cropped CT and their tissues: parts of this organ, and all of other
+    tissues.
 
     1 = kidney, 2 = tumour, the rest by name from 3.
     """

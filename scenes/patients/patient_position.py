@@ -1,4 +1,5 @@
-"""How the patient lay in the CT: by the user, by DICOM's PatientPosition (0018,5100), or assumed; and what the CT itself shows.
+"""How the patient lay in the CT: by the user, by DICOM's PatientPosition (0018,5100), or assumed; and what
+the CT itself shows.
 
 The organ at rest in the CT lies under the CT's gravity. Patient axes do not change with the position.
 """
@@ -46,7 +47,8 @@ BODY_ABOVE_HU, GAS_BELOW_HU, LUNG_ABOVE_HU, FLUID_ABOVE_HU = -300, -600, -900, -
 TABLE_ABOVE_HU = -500
 # A table is thinner than twice this, and an arm is not.
 THIN_MM = 8.0
-# Share of the body's shadow in which a table must be seen; a level's extent along a slice, and the area of all levels.
+# Share of the body's shadow in which a table must be seen; a level's extent along a slice, and the area of
+# all levels.
 LEAST_TABLE, LEVEL_MM, LEAST_LEVELS_CM2 = 0.3, 25.0, 3.0
 # On the lower side there is so many times as much of either as on any other side.
 CLEARLY = 2.0
@@ -55,7 +57,8 @@ LEVEL_DEPTH = 2
 
 
 def position_of(term: str, given: Position | None) -> tuple[Position, tuple[str, ...]]:
-    """The patient's position: the user's, else that of DICOM's PatientPosition, else supine; and notes of what was chosen.
+    """The patient's position: the user's, else that of DICOM's PatientPosition, else supine; and notes of
+    what was chosen.
 
     ``term`` is DICOM's, such as HFS or FFDL; it may be empty, or none that DICOM has.
     """
@@ -75,13 +78,16 @@ def position_warnings(ct: sitk.Image, position: Position) -> tuple[str, ...]:
     if seen in (None, position):
         return ()
     return (
-        f"the table, or the fluid levels in the bowel, are those of a patient {LYING[seen]}, but the organ is supported "
-        f"as {LYING[position]}; compare check.png with the patient; if the CT is right, give --position {seen}",
+        f"the table, or the fluid levels in the bowel, are those of a patient {LYING[seen]}, but the "
+        "organ is supported "
+        f"as {LYING[position]}; compare check.png with the patient; if the CT is right, give --position "
+        f"{seen}",
     )
 
 
 def seen_position(ct: sitk.Image) -> Position | None:
-    """The position in which a CT [HU] shows the patient: by the table under the body, and by fluid levels under gas in the bowel.
+    """The position in which a CT [HU] shows the patient: by the table under the body, and by fluid levels
+    under gas in the bowel.
 
     None where it shows neither clearly, or where they contradict each other.
     """

@@ -1,4 +1,6 @@
-"""The scene of an imported patient: its files, the materials of its parts, the CT window, the hilum, the support, the probe and where it starts."""
+"""The scene of an imported patient: its files, the materials of its parts, the CT window, the hilum, the
+support, the probe and where it starts.
+"""
 
 from typing import Any
 
@@ -35,7 +37,9 @@ HOUSING_MM = (16.0, 9.0, 6.0)
 
 
 def hilum(organ: trimesh.Trimesh, side: Side) -> tuple[float, float, float]:
-    """Centre of the hilum, LPS [mm]: around the medial vertex that is deepest below the surface's convex hull."""
+    """Centre of the hilum, LPS [mm]: around the medial vertex that is deepest below the surface's convex
+    hull.
+    """
     medial = np.array([-1.0 if side == "left" else 1.0, 0.0, 0.0])
     depth = depth_below_hull(organ, organ.vertices)
     facing = organ.vertex_normals @ medial > LEAST_MEDIAL
@@ -68,7 +72,8 @@ def stiffness_row(scene: Scene) -> tuple[str, str]:
     ]
     return (
         "stiffness",
-        f"{', '.join([f'parenchyma {tissue.young_kpa:g}', *words])} kPa (typical values; --uniform: one for all)",
+        f"{', '.join([f'parenchyma {tissue.young_kpa:g}', *words])} kPa (typical values; --uniform: one "
+        "for all)",
     )
 
 
@@ -78,7 +83,8 @@ def patient_scene(
     probe: str = PROBE,
     housing_mm: tuple[float, float, float] = HOUSING_MM,
 ) -> Scene:
-    """The scene that an import writes into the patient's folder: lying as in the CT, on its support, under a probe.
+    """The scene that an import writes into the patient's folder: lying as in the CT, on its support, under a
+    probe.
 
     ``uniform`` tissue has no parts of their own material.
     """

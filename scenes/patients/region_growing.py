@@ -1,9 +1,9 @@
 """Draft segmentation of a kidney without labels: region growing from a seed, for the user to check.
 
-No threshold separates every kidney from its neighbours, so several HU bands are tried, each with openings of several
-radii. The region most like a kidney is returned: convex, with an edge in HU along its surface. The bands are tried a second
-time around the HU of that region, so that the HU at the seed matter less. If no region is plausible, the seed is refused with
-the reason.
+No threshold separates every kidney from its neighbours, so several HU bands are tried, each with openings of
+several radii. The region most like a kidney is returned: convex, with an edge in HU along its surface. The
+bands are tried a second time around the HU of that region, so that the HU at the seed matter less. If no
+region is plausible, the seed is refused with the reason.
 """
 
 from collections.abc import Iterator
@@ -25,7 +25,8 @@ WORKING_MM = 2.0
 VOXEL_ML = WORKING_MM**3 / 1000.0
 PARENCHYMA_HU = (-10.0, 350.0)  # from unenhanced and noisy to pyramids in the excretory phase
 AIR_BELOW_HU = -200.0
-# Lower threshold of a region, between fat and seed: low where fat surrounds it, high where muscle, liver or spleen touches.
+# Lower threshold of a region, between fat and seed: low where fat surrounds it, high where muscle, liver or
+# spleen touches.
 LOW_SHARES = (0.45, 0.55, 0.65, 0.75, 0.85, 0.92)
 SAME_LEVEL = 0.05  # half a step of these shares
 ABOVE_SEED_HU = 150.0  # from a seed in the medulla to the cortex
@@ -42,7 +43,8 @@ ELSEWHERE = "if the seed is in a kidney, give a point farther from there, or dra
 def draft_segmentation(ct: LazyVolume, seed_mm: np.ndarray) -> LabelMap:
     """The kidney around a seed, on the CT's grid; deterministic.
 
-    It uses tissue and shape, not anatomy: from a seed in another compact organ surrounded by fat, it returns that organ.
+    It uses tissue and shape, not anatomy: from a seed in another compact organ surrounded by fat, it returns
+    that organ.
 
     Args:
         ct: scalar volume [HU]; read within REACH_MM of the seed.
@@ -107,7 +109,8 @@ def _most_like_a_kidney(tissue: sitk.Image, seed: np.ndarray) -> np.ndarray:
 
 
 def _start(tissue: sitk.Image, hounsfield: np.ndarray, seed: np.ndarray) -> np.ndarray:
-    """The voxel (x, y, z) near the seed with the most soft tissue around it. Raises PatientError: the seed is in none.
+    """The voxel (x, y, z) near the seed with the most soft tissue around it. Raises PatientError: the seed is
+    in none.
 
     In thick voxels, the cortex near the surface has the HU of the fat beside it.
     """
@@ -162,10 +165,11 @@ def _grown(
 
 
 def _opened_regions(tissue: sitk.Image, away: np.ndarray, low: float, high: float) -> Iterator[np.ndarray]:
-    """Regions (z, y, x) of a band of HU connected to the seed, separated at thin bridges; ``away`` is the distance to it [mm].
+    """Regions (z, y, x) of a band of HU connected to the seed, separated at thin bridges; ``away`` is the
+    distance to it [mm].
 
-    sitk.ConnectedThreshold, erosion by sitk.SignedMaurerDistanceMap, then sitk.BinaryDilate of the core at the seed only; a
-    plain opening would restore the neighbours' cores, too.
+    sitk.ConnectedThreshold, erosion by sitk.SignedMaurerDistanceMap, then sitk.BinaryDilate of the core at
+    the seed only; a plain opening would restore the neighbours' cores, too.
     """
     body = _connected(tissue, away, low, high, OFF_SEED_MM)
     depth = sitk.SignedMaurerDistanceMap(body, insideIsPositive=True, squaredDistance=False)
@@ -184,7 +188,9 @@ def _connected(image: sitk.Image, away: np.ndarray, low: float, high: float, off
 
 
 def _reconstructed(core: np.ndarray, body: np.ndarray, radius: int) -> np.ndarray:
-    """A core dilated within its body, with concavities (the sinus) closed and holes (calyces, stones) filled."""
+    """A core dilated within its body, with concavities (the sinus) closed and holes (calyces, stones)
+    filled.
+    """
     if _ml(core) > VOLUME_ML[1]:
         return core > 0
     rim = radius + 2 * CLOSING + 1
@@ -224,11 +230,13 @@ def _why_unlike(grid: VoxelGrid, region: Region) -> str:
     shape = f"the region of {_ml(region.inside):.0f} ml "
     if region.edge >= LEAST_EDGE:
         return (
-            f"{shape}fills {region.solidity:.0%} of its convex hull, where a kidney fills at least {LEAST_SOLIDITY:.0%}; it may be "
+            f"{shape}fills {region.solidity:.0%} of its convex hull, where a kidney fills at least "
+            f"{LEAST_SOLIDITY:.0%}; it may be "
             "two organs"
         )
     return (
-        f"{shape}has an edge on {region.edge:.0%} of its surface, where a kidney has at least {LEAST_EDGE:.0%}; "
+        f"{shape}has an edge on {region.edge:.0%} of its surface, where a kidney has at least "
+        f"{LEAST_EDGE:.0%}; "
         f"{_towards(grid, region.open_side)}, tissue of like HU touches it"
     )
 
@@ -237,7 +245,8 @@ def _where_it_leaks(grid: VoxelGrid, hounsfield: np.ndarray, start: np.ndarray, 
     away = np.argwhere(leak).mean(axis=0)[::-1] - start
     to = f"{_ml(leak):.0f} ml" if _ml(leak) > VOLUME_ML[1] else BORDER
     return (
-        f"the region goes on {_towards(grid, away)} into tissue of {np.median(hounsfield[leak]):.0f} HU, to {to}, where a kidney has "
+        f"the region goes on {_towards(grid, away)} into tissue of {np.median(hounsfield[leak]):.0f} HU, "
+        f"to {to}, where a kidney has "
         f"at most {VOLUME_ML[1]:g} ml"
     )
 

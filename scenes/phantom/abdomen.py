@@ -1,4 +1,5 @@
-"""Draw the abdomen of the embedded patient around its left kidney, by abdomen.toml, and the canvas to draw on.
+"""Draw the abdomen of the embedded patient around its left kidney, by abdomen.toml, and the canvas to draw
+on.
 
 LPS mm; signed distances [mm] are negative inside.
 """

@@ -1,4 +1,5 @@
-"""The embedded patient: drawn and imported when it is first needed, then kept as a patient's folder in a cache.
+"""The embedded patient: drawn and imported when it is first needed, then kept as a patient's folder in a
+cache.
 
 The generator and the importer are imported only to make it.
 """
@@ -24,7 +25,10 @@ SOURCES = ("phantom/*", "patients/*.py", "patients/readers/label_maps.py")
 
 
 def phantom_folder(progress: ReportProgress = no_progress) -> Path:
-    """The embedded patient's folder, from the cache where it is there. Raises SceneError where it cannot be written."""
+    """The embedded patient's folder, from the cache where it is there.
+
+    Raises SceneError where it cannot be written.
+    """
     files = sorted(path for pattern in SOURCES for path in SCENES.glob(pattern) if path.is_file())
     sources = b"".join(path.read_bytes() for path in files)
     name = f"phantom-{hashlib.sha256(sources).hexdigest()[:12]}"

@@ -1,7 +1,7 @@
 """The embedded patient: a contrast CT of a left kidney with a tumour, and its labels, from closed formulas.
 
-Supine, patient coordinates LPS in mm (+x left, +y posterior, +z head), so gravity points along +y. The result is
-deterministic. Signed distances [mm] are negative inside.
+Supine, patient coordinates LPS in mm (+x left, +y posterior, +z head), so gravity points along +y. The result
+is deterministic. Signed distances [mm] are negative inside.
 
 The kidney is built in a *kidney frame* (u, v, w) [mm]: w along the long axis to the upper pole, u away from
 the hilum, v to the anterior face. The frame is bent so that both poles lean to the hilum: the bean.
@@ -34,7 +34,9 @@ NOISE_CORRELATION = 0.6
 
 
 class Label(IntEnum):
-    """Tissue of a voxel, by its name in ultrasound/acoustic_tissues.toml; the union of all but 0 is the organ, one solid without cavities."""
+    """Tissue of a voxel, by its name in ultrasound/acoustic_tissues.toml; the union of all but 0 is the
+    organ, one solid without cavities.
+    """
 
     OUTSIDE = 0
     CORTEX = 1
@@ -279,7 +281,9 @@ def _paint_perirenal_space(canvas: Canvas, bean: np.ndarray, rng: np.random.Gene
 def _kidney_parts(
     canvas: Canvas, bean: np.ndarray, near: tuple, points: np.ndarray, rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """Distances [mm] to the parts: of vessels and urine on the canvas, of the others at voxels ``near``, with these points."""
+    """Distances [mm] to the parts: of vessels and urine on the canvas, of the others at voxels ``near``,
+    with these points.
+    """
     tumour, necrosis = _tumour(points, rng)
     kidney = bean[near] + _lobulation(points)
     urine, arteries, veins = (canvas.tube_distance(t()) for t in (_urinary_tract, _arteries, _veins))
@@ -332,7 +336,8 @@ def _labels(near: tuple, points: np.ndarray, parts: dict[str, np.ndarray]) -> np
     tissue[parts["tumour"] < 0] = Label.TUMOUR
     labels = np.zeros(parts["urine"].shape, dtype=np.uint8)
     labels[near] = tissue
-    # Fat between the stubs of the hilar vessels is added to the solid, which would otherwise have slits and cavities.
+    # Fat between the stubs of the hilar vessels is added to the solid, which would otherwise have slits and
+    # cavities.
     closed = ndimage.binary_fill_holes(ndimage.binary_closing(labels > 0, iterations=3))
     tissue[gate & closed[near] & (tissue == Label.OUTSIDE)] = Label.SINUS
     labels[near] = tissue

@@ -11,7 +11,10 @@ COARSE_MM, BEYOND_MM = 1.8, 45.0
 
 
 def bones(hu: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return cortical bone and marrow. Marrow may be no denser than enhanced soft tissue, but is enclosed by cortical bone."""
+    """Return cortical bone and marrow.
+
+    Marrow may be no denser than enhanced soft tissue, but is enclosed by cortical bone.
+    """
     step = np.maximum(1, np.rint(COARSE_MM / spacing_mm)).astype(int)
     if not (hu > BONE_ABOVE_HU).any():
         return np.zeros(hu.shape, bool)
@@ -29,7 +32,9 @@ def bones(hu: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
 
 
 def spine_middle(bone: np.ndarray) -> np.ndarray | None:
-    """Return the index (3,), fractional, of the middle of the spine, the largest bone (nx, ny, nz); None without a bone."""
+    """Return the index (3,), fractional, of the middle of the spine, the largest bone (nx, ny, nz); None
+    without a bone.
+    """
     parts, count = ndimage.label(bone)
     if count == 0:
         return None

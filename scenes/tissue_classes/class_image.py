@@ -1,4 +1,5 @@
-"""A class image: the tissue of every voxel as a segmentation of 3D Slicer (.seg.nrrd), to see beside the CT and to correct.
+"""A class image: the tissue of every voxel as a segmentation of 3D Slicer (.seg.nrrd), to see beside the CT
+and to correct.
 
 https://slicer.readthedocs.io/en/latest/developer_guide/modules/segmentations.html#segmentations-file-format-seg-nrrd
 """
@@ -12,14 +13,17 @@ from scenes.tissue_classes.tissue_map import CODE, TissueMap
 from scenes.volumes.voxel_grid import VoxelGrid
 
 CLASS_IMAGE_FILE = "classes.seg.nrrd"
-# What was drawn has its tissue's code and this in addition, the end of its segment's name, and less of its colour.
+# What was drawn has its tissue's code and this in addition, the end of its segment's name, and less of its
+# colour.
 DRAWN, DRAWN_NAME, PALE = 100, " (drawn)", 0.45
 # By this tag, which 3D Slicer keeps, an import knows the file.
 TAG = "Nephron.ClassImage:1"
 
 
 def class_image(found: TissueMap) -> sitk.Image:
-    """Return the label map, uint8, with segments for all tissues, so that each can be painted with; and for what was drawn."""
+    """Return the label map, uint8, with segments for all tissues, so that each can be painted with; and
+    for what was drawn.
+    """
     values = np.where(found.drawn, found.codes + DRAWN, found.codes).astype(np.uint8)
     boxes = ndimage.find_objects(values)
     voxels = np.ascontiguousarray(values.transpose(2, 1, 0))

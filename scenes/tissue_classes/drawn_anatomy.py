@@ -1,4 +1,6 @@
-"""What a CT does not show, drawn as atlases of anatomy have it: renal pyramids, the renal fascia, and the layers of muscle."""
+"""What a CT does not show, drawn as atlases of anatomy have it: renal pyramids, the renal fascia, and the
+layers of muscle.
+"""
 
 import numpy as np
 from scipy import ndimage
@@ -6,23 +8,27 @@ from scipy.spatial import cKDTree
 
 from scenes.tissue_classes.fine_grid import cell_voxels, coarse_distance, refined
 
-# Cortex over the pyramids, and the distance of the middles of their bases: 7 to 10 mm, and 7 to 18 pyramids in a kidney (Hansen, Nielsen &
+# Cortex over the pyramids, and the distance of the middles of their bases: 7 to 10 mm, and 7 to 18 pyramids
+# in a kidney (Hansen, Nielsen &
 # Ewertsen 2016, Diagnostics 6, 2).
 CORTEX_MM, APART_MM = 6.0, 21.0
 # Columns of cortex between pyramids, and the share of its base's radius that a pyramid has at its papilla.
 COLUMN_MM, PAPILLA_SHARE = 2.5, 0.4
 # A pyramid is at least so high.
 LEAST_HEIGHT_MM = 4.0
-# The fascia: in fat, so far from what is behind it, at least so far from the kidney and no farther than the third value.
+# The fascia: in fat, so far from what is behind it, at least so far from the kidney and no farther than the
+# third value.
 BEFORE_MM, LEAST_MM, MOST_MM, OPENED_VOXELS = 3.0, 4.0, 20.0, 3
-# Sheets of perimysium in muscle: distance, and where they are, as a threshold of noise of unit SD smoothed over this distance.
+# Sheets of perimysium in muscle: distance, and where they are, as a threshold of noise of unit SD smoothed
+# over this distance.
 SHEETS_MM, SHEETS_ABOVE, SHEETS_OVER_MM, SEED = 4.0, -0.2, 4.0, 20151124
 
 
 def draw_pyramids(
     parenchyma: np.ndarray, sinus: np.ndarray, depth_mm: np.ndarray, spacing_mm: np.ndarray
 ) -> np.ndarray:
-    """Return pyramids (nx, ny, nz) in parenchyma: cones with their bases CORTEX_MM below the surface, their papillae at the sinus.
+    """Return pyramids (nx, ny, nz) in parenchyma: cones with their bases CORTEX_MM below the surface, their
+    papillae at the sinus.
 
     ``depth_mm`` is below the kidney's outer surface. Without a sinus, the papillae are at the deepest place.
     """
@@ -54,7 +60,9 @@ def draw_pyramids(
 
 
 def _spread(points: np.ndarray) -> list[int]:
-    """Return indices of points (n, 3) [mm] that are APART_MM from each other, each the farthest from those before."""
+    """Return indices of points (n, 3) [mm] that are APART_MM from each other, each the farthest from those
+    before.
+    """
     chosen = [int(np.argmax(points @ [0.0, 0.0, 1.0]))]
     distance = np.linalg.norm(points - points[chosen[0]], axis=1)
     while distance.max() > APART_MM:
@@ -66,7 +74,9 @@ def _spread(points: np.ndarray) -> list[int]:
 def draw_fascia(
     fat: np.ndarray, others: np.ndarray, from_kidney_mm: np.ndarray, spacing_mm: np.ndarray
 ) -> np.ndarray:
-    """Return the renal fascia (nx, ny, nz): a sheet in the perirenal fat, one voxel thick, before what is behind the fat."""
+    """Return the renal fascia (nx, ny, nz): a sheet in the perirenal fat, one voxel thick, before what is
+    behind the fat.
+    """
     # Islands are nothing that fat has its fascia before.
     behind = ndimage.binary_opening(others, iterations=OPENED_VOXELS)
     sheet = np.abs(coarse_distance(~behind, spacing_mm) - BEFORE_MM) <= 0.5 * float(spacing_mm.max())
@@ -74,7 +84,9 @@ def draw_fascia(
 
 
 def draw_perimysium(muscle: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return broken sheets (nx, ny, nz) of connective tissue in muscle, one voxel thick, parallel to its surface."""
+    """Return broken sheets (nx, ny, nz) of connective tissue in muscle, one voxel thick, parallel to its
+    surface.
+    """
     # Noise of one value a cell, between which it is interpolated.
     step = cell_voxels(spacing_mm)
     cells = -(-np.array(muscle.shape) // step)

@@ -1,6 +1,8 @@
-"""A finer grid for CTs with thick slices: HU interpolated linearly, labels by their distances (Raya & Udupa 1990, IEEE Trans Med Imaging 9, 32).
+"""A finer grid for CTs with thick slices: HU interpolated linearly, labels by their distances (Raya & Udupa
+1990, IEEE Trans Med Imaging 9, 32).
 
-Without it, the border of an organ in slices of 5 mm is a stair, and each of its steps an interface of its own in the B-mode image.
+Without it, the border of an organ in slices of 5 mm is a stair, and each of its steps an interface of its own
+in the B-mode image.
 """
 
 import numpy as np
@@ -29,7 +31,9 @@ def fine_factors(spacing_mm: np.ndarray) -> np.ndarray:
 
 
 def fine_index_from_mm(index_from_mm: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Return the transform (4, 4) from mm to the indices of the finer grid, whose first voxel begins where the CT's first does."""
+    """Return the transform (4, 4) from mm to the indices of the finer grid, whose first voxel begins where
+    the CT's first does.
+    """
     scale = np.diag([*factors.astype(float), 1.0])
     scale[:3, 3] = (factors - 1) / 2
     return scale @ index_from_mm
@@ -50,7 +54,9 @@ def refined(values: np.ndarray, factors: np.ndarray) -> np.ndarray:
 
 
 def refined_labels(labels: np.ndarray, factors: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return labels on the finer grid: of each voxel the label that it is deepest in, 0 where it is in none."""
+    """Return labels on the finer grid: of each voxel the label that it is deepest in, 0 where it is in
+    none.
+    """
     if (factors == 1).all():
         return labels
     fine = np.zeros(np.array(labels.shape) * factors, labels.dtype)
@@ -68,16 +74,19 @@ def refined_labels(labels: np.ndarray, factors: np.ndarray, spacing_mm: np.ndarr
 
 
 def signed_distance_of(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return distances [mm] (nx, ny, nz) from the voxels of a mask less those from the voxels outside; negative inside.
+    """Return distances [mm] (nx, ny, nz) from the voxels of a mask less those from the voxels outside;
+    negative inside.
 
-    Linear between neighbours, it is 0 halfway between a voxel inside and one outside, however long voxels are along an axis.
+    Linear between neighbours, it is 0 halfway between a voxel inside and one outside, however long voxels are
+    along an axis.
     """
     outside = ndimage.distance_transform_edt(~mask, sampling=spacing_mm)
     return (outside - ndimage.distance_transform_edt(mask, sampling=spacing_mm)).astype(np.float32)
 
 
 def coarse_distance(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return distances [mm] (nx, ny, nz) of the voxels of a mask from those outside it, computed in cells of about CELL_MM, and interpolated.
+    """Return distances [mm] (nx, ny, nz) of the voxels of a mask from those outside it, computed in cells of
+    about CELL_MM, and interpolated.
 
     A cell belongs to the mask if half of its voxels do.
     """
@@ -120,7 +129,8 @@ def surface_box(
 
 
 class SurfaceGrid:
-    """Points SURFACE_MM apart around a closed surface, at which ``distance`` [mm] from it is known, negative inside.
+    """Points SURFACE_MM apart around a closed surface, at which ``distance`` [mm] from it is known, negative
+    inside.
 
     ``at_voxels`` interpolates values at them for a box of another grid.
     """
@@ -131,7 +141,9 @@ class SurfaceGrid:
         self.distance = distances_on_grid(surface, self.low, tuple(counts), SURFACE_MM, EXACT_MM)
 
     def at_voxels(self, values: np.ndarray, box: Box, index_from_mm: np.ndarray) -> np.ndarray:
-        """Return values of this grid at the voxels of a box, float32, linear between points; of the nearest point outside the grid."""
+        """Return values of this grid at the voxels of a box, float32, linear between points; of the
+        nearest point outside the grid.
+        """
         mm_from_index = np.linalg.inv(index_from_mm)
         first = mm_from_index[:3, :3] @ [a.start for a in box] + mm_from_index[:3, 3]
         # In indices of both grids, whose spacing is 1 for SimpleITK.

@@ -1,20 +1,24 @@
-"""Parts of a kidney that nobody labelled, by HU, depth and contrast phase: sinus, vessels of the hilum, cortex and medulla."""
+"""Parts of a kidney that nobody labelled, by HU, depth and contrast phase: sinus, vessels of the hilum,
+cortex and medulla.
+"""
 
 import numpy as np
 from scipy import ndimage
 
 # Parenchyma above this has contrast agent: without, it has 30 to 50 HU.
 ENHANCED_FROM_HU = 75.0
-# Cortex is brighter than medulla by this, or more, in the corticomedullary phase. The outer part of the parenchyma is cortex, the inner
-# part has both.
+# Cortex is brighter than medulla by this, or more, in the corticomedullary phase. The outer part of the
+# parenchyma is cortex, the inner part has both.
 CORTEX_ABOVE_MEDULLA_HU, OUTER_MM, INNER_MM, LEAST_VOXELS = 40.0, (2.0, 5.0), (9.0, 16.0), 50
 # Fat nearer to the kidney's outer surface than this is partial volume of its label's rim.
 RIM_MM = 5.0
 FAT_BELOW_HU = -20.0
-# In the hollow of a kidney, what is nearly as bright as parenchyma is a vessel or the pelvis: without contrast agent, so much darker at most,
-# as fat in the same voxels makes more of a difference, and so much brighter, as a stone's blur is more; with it, this share of its HU at least.
+# In the hollow of a kidney, what is nearly as bright as parenchyma is a vessel or the pelvis: without
+# contrast agent, so much darker at most, as fat in the same voxels makes more of a difference, and so much
+# brighter, as a stone's blur is more; with it, this share of its HU at least.
 VESSEL_AGAINST_MEDIAN_HU, ENHANCED_VESSEL_SHARE = (-10.0, 30.0), 0.6
-# In a kidney with contrast agent, what has less than this share of the parenchyma's HU, or of its medulla's, is sinus or a calyx without.
+# In a kidney with contrast agent, what has less than this share of the parenchyma's HU, or of its medulla's,
+# is sinus or a calyx without.
 SINUS_SHARE = 0.5
 # Parenchyma is brighter than this, with or without contrast agent; urine without is darker.
 PARENCHYMA_ABOVE_HU = 30.0
@@ -28,7 +32,8 @@ def median_hu(hu: np.ndarray, parenchyma: np.ndarray) -> float:
 def kidney_parts(
     hu: np.ndarray, parenchyma: np.ndarray, hollow: np.ndarray, depth_mm: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return masks (nx, ny, nz) of the parts of a kidney by tissue, apart from each other: "kidney", or "cortex" and "medulla", and others.
+    """Return masks (nx, ny, nz) of the parts of a kidney by tissue, apart from each other: "kidney", or
+    "cortex" and "medulla", and others.
 
     Args:
         hu: smoothed.

@@ -13,18 +13,23 @@ from scenes.tissue_classes.fine_grid import cell_voxels, repeated
 from scenes.tissue_classes.vessels import blood
 
 GAS_BELOW_HU, FAT_BELOW_HU, METAL_ABOVE_HU = -300.0, -30.0, 2500.0
-# Marrow where its shell is not closed: share of its surface that is bone; without contrast agent, by its HU and volume.
+# Marrow where its shell is not closed: share of its surface that is bone; without contrast agent, by its HU
+# and volume.
 MARROW_SURFACE, ENHANCED_MARROW_ABOVE_HU, MARROW_ABOVE_HU, LEAST_MARROW_ML = 0.4, 140.0, 120.0, 0.4
-# Contrast agent in the bowel: so bright, so far in front of the spine's middle, and with this share of its volume deeper than a bone's shell.
+# Contrast agent in the bowel: so bright, so far in front of the spine's middle, and with this share of its
+# volume deeper than a bone's shell.
 DENSE_ABOVE_HU, BEFORE_SPINE_MM, SHELL_MM, SOLID_SHARE = 260.0, 15.0, 2.5, 0.1
 # Of an enhanced CT, muscle is darker than this, liver and spleen are brighter.
 LIVER_ABOVE_HU = 88.0
-# Bile, and fluid in the bowel: with contrast agent, and without; in bodies with so many cells to each side of their middle.
+# Bile, and fluid in the bowel: with contrast agent, and without; in bodies with so many cells to each side of
+# their middle.
 ENHANCED_FLUID_HU, FLUID_HU, FLUID_CELLS = (-10.0, 32.0), (-10.0, 12.0), 2
-# Large bodies of soft tissue are searched in cells of this size; they contain a ball of the first radius, liver and spleen of the second.
+# Large bodies of soft tissue are searched in cells of this size; they contain a ball of the first radius,
+# liver and spleen of the second.
 CELL_MM, BODY_MM, ORGAN_MM = 3.0, 7.0, 12.0
 BODIES = ("muscle", "liver", "spleen")
-# Without contrast agent, muscle is behind or beside the spine: so far behind the kidney's middle, so near to the spine's.
+# Without contrast agent, muscle is behind or beside the spine: so far behind the kidney's middle, so near to
+# the spine's.
 BEHIND_MM, BESIDE_SPINE_MM = 25.0, 45.0
 # Soft tissue so near to gas is bowel.
 BOWEL_WALL_MM = 12.0
@@ -32,7 +37,9 @@ BOWEL_WALL_MM = 12.0
 
 @dataclass(frozen=True)
 class Place:
-    """Where a kidney is in a CT: ``index_from_mm`` (4, 4), its middle (3,), LPS [mm], and whether it has contrast agent."""
+    """Where a kidney is in a CT: ``index_from_mm`` (4, 4), its middle (3,), LPS [mm], and whether it has
+    contrast agent.
+    """
 
     index_from_mm: np.ndarray
     middle_mm: np.ndarray
@@ -77,7 +84,9 @@ def surroundings(
 
 
 def _oral_agent(hu: np.ndarray, bone: np.ndarray, place: Place) -> np.ndarray:
-    """Return what was taken for bone, but is contrast agent in the bowel: in front of the spine, and solid, where a bone is a shell."""
+    """Return what was taken for bone, but is contrast agent in the bowel: in front of the spine, and
+    solid, where a bone is a shell.
+    """
     agent = np.zeros(bone.shape, bool)
     step = cell_voxels(place.spacing_mm, CELL_MM)
     spine = _spine(block_reduce(bone, tuple(step), np.mean) >= 0.5, step, place)
@@ -98,7 +107,9 @@ def _oral_agent(hu: np.ndarray, bone: np.ndarray, place: Place) -> np.ndarray:
 
 
 def _marrow(hu: np.ndarray, bone: np.ndarray, kidney: np.ndarray, place: Place) -> np.ndarray:
-    """Return bright pieces whose surface is bone for the most part; without contrast agent, all large bright pieces."""
+    """Return bright pieces whose surface is bone for the most part; without contrast agent, all large
+    bright pieces.
+    """
     bright = (hu > (ENHANCED_MARROW_ABOVE_HU if place.is_enhanced else MARROW_ABOVE_HU)) & ~kidney & ~bone
     pieces, count = ndimage.label(bright)
     sizes = np.bincount(pieces.ravel(), minlength=count + 1)
@@ -179,20 +190,26 @@ def _fluid_hu(is_enhanced: bool) -> tuple[float, float]:
 
 
 def _spine(bone: np.ndarray, step: np.ndarray, place: Place) -> np.ndarray | None:
-    """Return the middle (3,) of the spine, from the kidney's [mm], by a mask of cells; None without a bone."""
+    """Return the middle (3,) of the spine, from the kidney's [mm], by a mask of cells; None without a
+    bone.
+    """
     middle = spine_middle(bone)
     return None if middle is None else place.of_indices((middle[None] + 0.5) * step - 0.5)[0]
 
 
 def _middle(cells: np.ndarray, step: np.ndarray, first: list[int]) -> np.ndarray:
-    """Return the index (1, 3) of the voxel, fractional, in the middle of a mask of cells, in a box whose first cell is given."""
+    """Return the index (1, 3) of the voxel, fractional, in the middle of a mask of cells, in a box whose
+    first cell is given.
+    """
     return ((np.argwhere(cells) + first).mean(axis=0)[None] + 0.5) * step - 0.5
 
 
 def _body(
     level_hu: float, radius_mm: float, at: np.ndarray, spine: np.ndarray | None, is_enhanced: bool
 ) -> str:
-    """Return the tissue of a body of soft tissue by its HU, the ball in it, and its place from the kidney [mm]."""
+    """Return the tissue of a body of soft tissue by its HU, the ball in it, and its place from the kidney
+    [mm].
+    """
     if level_hu < _fluid_hu(is_enhanced)[1]:
         return "soft-tissue"
     beside_spine = spine is not None and abs(at[0] - spine[0]) < BESIDE_SPINE_MM and at[1] > spine[1] - 25.0

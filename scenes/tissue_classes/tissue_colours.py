@@ -1,4 +1,6 @@
-"""Colours of tissues, as atlases of anatomy have them: fat yellow, arteries red, veins blue, bile and urine green to yellow."""
+"""Colours of tissues, as atlases of anatomy have them: fat yellow, arteries red, veins blue, bile and
+urine green to yellow.
+"""
 
 # Tissue -> red, green and blue (hexadecimal), of all that a voxel can be.
 COLOURS = {

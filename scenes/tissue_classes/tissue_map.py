@@ -1,4 +1,5 @@
-"""The tissue of every voxel around a kidney: labels where there are any, and the CT's HU, place and contrast phase elsewhere.
+"""The tissue of every voxel around a kidney: labels where there are any, and the CT's HU, place and contrast
+phase elsewhere.
 
 What no CT shows (pyramids without enhancement, the renal fascia) is drawn on request, and marked.
 """
@@ -66,7 +67,8 @@ MARGIN_MM = MOST_MM + 4.0
 
 @dataclass(frozen=True)
 class TissueMap:
-    """Tissue of each voxel (nx, ny, nz): ``codes`` of TISSUES from 1, uint8, on a grid that ``index_from_mm`` (4, 4) gives.
+    """Tissue of each voxel (nx, ny, nz): ``codes`` of TISSUES from 1, uint8, on a grid that ``index_from_mm``
+    (4, 4) gives.
 
     ``hu`` int16 is on the same grid. ``drawn`` is what no CT shows.
     """
@@ -88,7 +90,9 @@ class TissueMap:
 
 @dataclass(frozen=True)
 class KidneyShape:
-    """In a ``box`` of a grid: distances [mm] from the organ's surface, and from it with its hollows filled; negative inside."""
+    """In a ``box`` of a grid: distances [mm] from the organ's surface, and from it with its hollows
+    filled; negative inside.
+    """
 
     box: Box
     distance_mm: np.ndarray
@@ -167,7 +171,9 @@ def tissue_map(
 def dense_pieces_of_kidney(
     hu: np.ndarray, labels: np.ndarray, organ: trimesh.Trimesh, index_from_mm: np.ndarray
 ) -> tuple[DensePieces, np.ndarray]:
-    """Return the dense pieces that ``tissue_map`` finds in the same CT, and the transform (4, 4) from mm to their indices."""
+    """Return the dense pieces that ``tissue_map`` finds in the same CT, and the transform (4, 4) from mm
+    to their indices.
+    """
     spacing = np.linalg.norm(np.linalg.inv(index_from_mm[:3, :3]), axis=0)
     factors = fine_factors(spacing)
     own = refined_labels(labels, factors, spacing)
@@ -199,14 +205,19 @@ def of_tissues(codes: np.ndarray, *tissues: str) -> np.ndarray:
 
 
 def _median(hu: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return the median of each voxel and its neighbours: noise goes, edges stay. Thick slices are not mixed."""
+    """Return the median of each voxel and its neighbours: noise goes, edges stay.
+
+    Thick slices are not mixed.
+    """
     radius = [0 if mm > 2 * spacing_mm.min() else 1 for mm in spacing_mm]
     image = sitk.GetImageFromArray(np.rint(hu).astype(np.int16, order="C"))
     return sitk.GetArrayFromImage(sitk.Median(image, radius[::-1]))
 
 
 def _outer_distance(distance_mm: np.ndarray) -> np.ndarray:
-    """Return distances [mm] from a surface whose hollows are filled, on the grid of a SurfaceGrid: closing by a ball."""
+    """Return distances [mm] from a surface whose hollows are filled, on the grid of a SurfaceGrid: closing
+    by a ball.
+    """
     near = distance_mm <= CONCAVITY_MM
     # From the middles of points: half of their distance is not known.
     inside = ndimage.distance_transform_edt(near, sampling=SURFACE_MM) - SURFACE_MM / 2
@@ -216,7 +227,9 @@ def _outer_distance(distance_mm: np.ndarray) -> np.ndarray:
 def _bones_and_arteries(
     hu: np.ndarray, labels: np.ndarray, index_from_mm: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return masks of bones, and of the aorta with its branches where these are as bright: in the arterial phase."""
+    """Return masks of bones, and of the aorta with its branches where these are as bright: in the arterial
+    phase.
+    """
     mm_from_index = np.linalg.inv(index_from_mm)
     spacing = np.linalg.norm(mm_from_index[:3, :3], axis=0)
     bone = bones(hu, spacing)

@@ -1,19 +1,22 @@
-"""Vessels around a kidney in an enhanced CT: the aorta of the arterial phase, which is as bright as bone, and other blood by HU."""
+"""Vessels around a kidney in an enhanced CT: the aorta of the arterial phase, which is as bright as bone,
+and other blood by HU.
+"""
 
 import numpy as np
 from scipy import ndimage
 
 from scenes.tissue_classes.fine_grid import CELL_MM, cell_voxels, repeated
 
-# In the arterial phase the aorta is brighter than this, as bone is. It contains a ball of this radius, and is as long as the CT, as far as that
-# is at least so long: marrow as bright ends at the discs. It is so far in front of the spine's middle, and no farther beside it: there is
-# no bowel.
+# In the arterial phase the aorta is brighter than this, as bone is. It contains a ball of this radius, and is
+# as long as the CT, as far as that is at least so long: marrow as bright ends at the discs. It is so far in
+# front of the spine's middle, and no farther beside it: there is no bowel.
 ARTERIAL_ABOVE_HU, AORTA_RADIUS_MM, SHARE_OF_CT, LEAST_LENGTH_MM = 250.0, 4.5, 0.8, 60.0
 BEFORE_SPINE_MM, BESIDE_SPINE_MM = 15.0, 45.0
 # Its branches have this share of its HU at least.
 BRANCH_SHARE = 0.75
-# Blood is brighter than this, averaged over this width, and than liver and spleen by the third value; at the rim of a vessel, brighter than the
-# fourth. A narrower vessel is brighter than this in each voxel. Contrast agent in ureter and bowel is brighter than the last.
+# Blood is brighter than this, averaged over this width, and than liver and spleen by the third value; at the
+# rim of a vessel, brighter than the fourth. A narrower vessel is brighter than this in each voxel. Contrast
+# agent in ureter and bowel is brighter than the last.
 BLOOD_ABOVE_HU, AVERAGED_MM, ABOVE_ORGAN_HU, RIM_ABOVE_HU = 125.0, 4.0, 14.0, 90.0
 THIN_ABOVE_HU, AGENT_ABOVE_HU = 140.0, 260.0
 
@@ -50,7 +53,9 @@ def arterial_aorta(hu: np.ndarray, mm_from_index: np.ndarray, spine_mm: np.ndarr
 
 
 def with_branches(hu: np.ndarray, aorta: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return an aorta with what is connected to it, nearly as bright, and nothing of the others: bone and kidney."""
+    """Return an aorta with what is connected to it, nearly as bright, and nothing of the others: bone and
+    kidney.
+    """
     if not aorta.any():
         return aorta
     bright = aorta | ((hu > BRANCH_SHARE * np.median(hu[aorta])) & ~others)

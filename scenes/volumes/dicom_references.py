@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class DicomReferences:
-    """Identifiers (PHI, never shown) of a CT's own objects, or of those that labels refer to; empty where a file has none."""
+    """Identifiers (PHI, never shown) of a CT's own objects, or of those that labels refer to; empty where
+    a file has none.
+    """
 
     frames: frozenset[str] = frozenset()  # FrameOfReferenceUID
     series: frozenset[str] = frozenset()  # SeriesInstanceUID
@@ -39,7 +41,8 @@ def doubts(labels: DicomReferences, ct: DicomReferences) -> tuple[str, ...]:
     frame, drawn_on, patient = _shared(labels, ct)
     if drawn_on and frame is False:
         return (
-            "the labels have another frame of reference than the CT, but refer to its series: taken as labels of it",
+            "the labels have another frame of reference than the CT, but refer to its series: taken as "
+            "labels of it",
         )
     if frame and drawn_on is False:
         return ("the labels were drawn on another series of this CT's frame of reference",)
@@ -49,7 +52,9 @@ def doubts(labels: DicomReferences, ct: DicomReferences) -> tuple[str, ...]:
 
 
 def _shared(labels: DicomReferences, ct: DicomReferences) -> tuple[bool | None, bool | None, bool | None]:
-    """Whether they share the frame of reference, the series or slices, the patient ID; None where one has none."""
+    """Whether they share the frame of reference, the series or slices, the patient ID; None where one has
+    none.
+    """
     series, slices = _common(labels.series, ct.series), _common(labels.instances, ct.instances)
     known = [one for one in (series, slices) if one is not None]
     patient = labels.patient == ct.patient if labels.patient and ct.patient else None

@@ -21,7 +21,8 @@ ENDINGS_OF = {"NIfTI": (".nii",), "NRRD": NRRD, "MetaImage": META, "DICOM": (".d
 
 
 def check_kind(path: Path) -> None:
-    """Raises PatientError where a volume file is of another format than its name ends in, or compressed in another way, or a web page.
+    """Raises PatientError where a volume file is of another format than its name ends in, or compressed in
+    another way, or a web page.
 
     Content of no known format is left to the reader of the name's format.
     """
@@ -46,7 +47,8 @@ def check_kind(path: Path) -> None:
     else:
         advice = f"rename it to end in {ENDINGS_OF[kind][0]}{'.gz' * is_compressed}"
     raise PatientError(
-        f"{path}: is {found}; expected {expected}{' compressed by gzip' * is_named_gzip} by its name; {advice}"
+        f"{path}: is {found}; expected {expected}{' compressed by gzip' * is_named_gzip} by its name; "
+        f"{advice}"
     )
 
 

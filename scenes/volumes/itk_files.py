@@ -1,4 +1,6 @@
-"""Read NRRD and MetaImage with ITK, after checks of what ITK trusts: the header, and which file holds the voxels."""
+"""Read NRRD and MetaImage with ITK, after checks of what ITK trusts: the header, and which file holds the
+voxels.
+"""
 
 import re
 from collections.abc import Iterator
@@ -27,9 +29,11 @@ HEADER_BYTES, LINE_BYTES, NAME_LETTERS = 1 << 22, 1 << 16, 255
 
 
 def itk_volume(path: Path, vectors: bool = False, space: Space | None = None) -> LazyVolume:
-    """Read the header of an NRRD or MetaImage file; voxels (z, y, x), of vectors (z, y, x, n), are read on demand.
+    """Read the header of an NRRD or MetaImage file; voxels (z, y, x), of vectors (z, y, x, n), are read on
+    demand.
 
-    ``space`` is that of a file that names none. Raises PatientError: damaged, not 3D, of several numbers per voxel but for ``vectors``, without a place in the patient.
+    ``space`` is that of a file that names none. Raises PatientError: damaged, not 3D, of several numbers per
+    voxel but for ``vectors``, without a place in the patient.
     """
     data_file = file_with_voxels(path)
     _check_space(path)
@@ -64,7 +68,8 @@ def _check_space(path: Path) -> None:
     named = dict(_header_fields(path)).get("space", "") if path.suffix.lower() in NRRD else ""
     if named and named.casefold() not in SPACES_OF_NRRD:
         raise PatientError(
-            f"{path}: its field space is {named[:60]!r}, which NRRD does not have; expected such as left-posterior-superior; export it again, "
+            f"{path}: its field space is {named[:60]!r}, which NRRD does not have; expected such as "
+            "left-posterior-superior; export it again, "
             "for example from 3D Slicer, or correct the field"
         )
 
@@ -78,7 +83,10 @@ def _missing_orientation(path: Path, reader: sitk.ImageFileReader) -> str:
         return "has no space field (such as left-posterior-superior)"
     # ITK has converted the anatomical ones to this.
     if (space := reader.GetMetaData("NRRD_space")) != "left-posterior-superior":
-        return f"its space is {space}, which names no axes of the patient (expected such as left-posterior-superior)"
+        return (
+            f"its space is {space}, which names no axes of the patient (expected such as "
+            "left-posterior-superior)"
+        )
     return ""
 
 
@@ -107,7 +115,8 @@ def file_with_voxels(path: Path) -> Path:
         if len(names) != 1 or dimensions != ["3"]:
             found = " and ".join(dimensions)[:20] or "no"
             raise PatientError(
-                f"{path}: its header has {found} dimensions; expected one 3D volume and one file with its voxels; export one volume"
+                f"{path}: its header has {found} dimensions; expected one 3D volume and one file with its "
+                "voxels; export one volume"
             )
     if not names or names in (["LOCAL"], ["local"]):
         return path
@@ -118,7 +127,8 @@ def file_with_voxels(path: Path) -> Path:
     beside = (path.parent / name).resolve() if is_plain else path
     if not is_plain or len(names) > 1 or not beside.is_relative_to(path.parent.resolve()):
         raise PatientError(
-            f"{path}: its voxels are in {name[:60]!r}; expected one file in the same folder; convert it to one NRRD file"
+            f"{path}: its voxels are in {name[:60]!r}; expected one file in the same folder; convert it to "
+            "one NRRD file"
         )
     if not beside.is_file():
         raise PatientError(f"{path}: its voxels are in {name[:60]!r}, which is missing; copy both files")

@@ -57,7 +57,8 @@ class LazyVolume:
         free = psutil.virtual_memory().available
         if needed > free:
             raise PatientError(
-                f"{self.name}: takes {needed / 1e9:.1f} GB to read, and {free / 1e9:.1f} GB are free; close other programs, or "
+                f"{self.name}: takes {needed / 1e9:.1f} GB to read, and {free / 1e9:.1f} GB are free; close "
+                "other programs, or "
                 "crop the volume around the kidney"
             )
         voxels = self.read_box(box)
@@ -92,7 +93,8 @@ def check_size(path: Path, grid: VoxelGrid, voxel_bytes: int, held_bytes: int, c
 def no_orientation(path: Path, what: str) -> PatientError:
     """The error for a file that does not say where its axes point in the patient."""
     return PatientError(
-        f"{path}: {what}, so left and right may be exchanged; export it again with its orientation, for example from 3D Slicer; if you know "
+        f"{path}: {what}, so left and right may be exchanged; export it again with its orientation, for "
+        "example from 3D Slicer; if you know "
         f"where its axes point, give --space, one of {', '.join(SPACES)}"
     )
 

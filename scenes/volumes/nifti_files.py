@@ -27,7 +27,8 @@ RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
 
 
 def nifti_volume(path: Path, space: Space | None = None) -> LazyVolume:
-    """Read the header of a volume; voxels are read on demand. ``space`` is that of a file without an orientation.
+    """Read the header of a volume; voxels are read on demand. ``space`` is that of a file without an
+    orientation.
 
     Raises PatientError: damaged, not 3D, sheared, no orientation.
     """
@@ -59,7 +60,9 @@ def nifti_volume(path: Path, space: Space | None = None) -> LazyVolume:
 
 
 def _label_names(header: Any) -> dict[str, str]:
-    """Names of label values from the header extension of Connectome Workbench, which TotalSegmentator writes."""
+    """Names of label values from the header extension of Connectome Workbench, which TotalSegmentator
+    writes.
+    """
     found: dict[str, str] = {}
     with contextlib.suppress(Exception):  # a damaged extension has no names
         for extension in header.extensions:

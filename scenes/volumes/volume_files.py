@@ -25,11 +25,12 @@ def file_volume(path: Path, vectors: bool = False, space: Space | None = None) -
 
     Args:
         path: NIfTI, NRRD or MetaImage.
-        vectors: whether an NRRD or MetaImage may have several numbers per voxel: the layers of a segmentation.
-        space: of the axes of a file that does not name it; a file's own counts before it.
+        vectors: whether an NRRD or MetaImage may have several numbers per voxel: the layers of a
+        segmentation. space: of the axes of a file that does not name it; a file's own counts before it.
 
     Raises:
-        PatientError: of another format than its name says, damaged, not 3D, sheared, or without an orientation where no ``space`` is given.
+        PatientError: of another format than its name says, damaged, not 3D, sheared, or without an
+        orientation where no ``space`` is given.
     """
     check_kind(path)
     if not path.name.lower().endswith(NIFTI):

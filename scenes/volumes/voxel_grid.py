@@ -78,11 +78,13 @@ class VoxelGrid:
         if not ((self.spacing >= least) & (self.spacing <= most)).all():
             voxel = " x ".join(f"{s:g}" for s in self.spacing)
             raise PatientError(
-                f"{name}: voxels of {voxel} mm; expected {least:g} to {most:g} mm along each axis; export the volume again in mm"
+                f"{name}: voxels of {voxel} mm; expected {least:g} to {most:g} mm along each axis; export "
+                "the volume again in mm"
             )
         if np.abs(self.direction.T @ self.direction - np.eye(3)).max() > MOST_SHEAR:
             raise PatientError(
-                f"{name}: the axes are sheared; expected axes at right angles; resample the volume, for example in 3D Slicer"
+                f"{name}: the axes are sheared; expected axes at right angles; resample the volume, for "
+                "example in 3D Slicer"
             )
         return self
 

@@ -106,17 +106,23 @@ class CalibrateOptions(CommandOptions):
     out: Path
     """Folder for tables and figures."""
     model: Annotated[str, click.Choice(list(TISSUES))] = "shape-matching"
-    """neo-hookean: estimate moduli and friction; the options for radii, hold-out, grid and search are of shape-matching."""
+    """neo-hookean: estimate moduli and friction; the options for radii, hold-out, grid and search are of
+    shape-matching.
+    """
     quality: Annotated[str, click.Choice(QUALITIES)] = "balanced"
     """neo-hookean: a preset."""
     radii: str = "2.2,2.5,2.7,3.0,3.3"
     """Particle radii in mm."""
     hold_out: Literal["stages", "beads", "cases"] = "stages"
-    """Data that is not fitted but judges the fit: each case's deepest stage, every third bead, or the last CASE."""
+    """Data that is not fitted but judges the fit: each case's deepest stage, every third bead, or the last
+    CASE.
+    """
     grid: float = Field(0.05, ge=0.01, le=0.5)
     """Spacing of the stiffnesses tried; around the best it is a fifth of that."""
     search: int | None = Field(None, ge=1, le=1000)
-    """Instead of the stiffness alone, search stiffness, over-relaxation and iterations for this many generations."""
+    """Instead of the stiffness alone, search stiffness, over-relaxation and iterations for this many
+    generations.
+    """
     jobs: int | None = Field(None, ge=1, le=1024)
     """Processes on this machine [one a processor]."""
     dask: str | None = None
@@ -128,8 +134,9 @@ def calibrate(asked: CalibrateOptions) -> None:
     """Fit a tissue model to bead experiments.
 
     The experiments are the folders CASE.
-    Shape matching as the paper did: every stiffness is tried for each particle radius, and judged on held-out data.
-    neo-hookean: moduli, Poisson's ratio and friction by least squares, from beads and, where the case has them, forces on the probe.
+    Shape matching as the paper did: every stiffness is tried for each particle radius, and judged on held-out
+    data. neo-hookean: moduli, Poisson's ratio and friction by least squares, from beads and, where the case
+    has them, forces on the probe.
     """
     asked = asked.model_copy(update={"case": without_system_files(asked.case) or asked.case})
     if asked.model == USUAL:

@@ -1,7 +1,8 @@
-"""Files of a bead experiment: an organ on its support, pressed stage by stage, with beads measured at each stage.
+"""Files of a bead experiment: an organ on its support, pressed stage by stage, with beads measured at each
+stage.
 
-A case is a folder with ``case.toml`` (``CaseFile`` below), two closed surfaces and a table of beads. Lengths are mm in
-the frame of the organ's surface. Other keys are ignored.
+A case is a folder with ``case.toml`` (``CaseFile`` below), two closed surfaces and a table of beads. Lengths
+are mm in the frame of the organ's surface. Other keys are ignored.
 """
 
 import hashlib
@@ -44,7 +45,10 @@ Rotation = Annotated[tuple[Vector3, Vector3, Vector3], LIST, AfterValidator(_pro
 
 
 class CaseSection(BaseModel):
-    """A table of case.toml. Other keys are ignored, unless they are a known key in another unit. A text is no number."""
+    """A table of case.toml.
+
+    Other keys are ignored, unless they are a known key in another unit. A text is no number.
+    """
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False, strict=True)
 
@@ -104,7 +108,9 @@ class Files(CaseSection):
 
 
 class CaseProbe(CaseSection):
-    """A cuboid, full lengths along its own axes, edges rounded inside them; columns of ``rotation`` are these axes."""
+    """A cuboid, full lengths along its own axes, edges rounded inside them; columns of ``rotation`` are
+    these axes.
+    """
 
     shape: Literal["cuboid"]
     size_mm: tuple[Length, ...] = Field(min_length=3, max_length=3, strict=False)
@@ -132,7 +138,8 @@ class CaseHold(CaseSection):
 class CaseStage(CaseSection):
     """Centre of the probe and its travel since stage 0; with its own rotation if it has turned.
 
-    ``slide_mm``: how far it moved sideways from the line of the press. ``probe_force_N``: the probe's force on the tissue.
+    ``slide_mm``: how far it moved sideways from the line of the press. ``probe_force_N``: the probe's force
+    on the tissue.
     """
 
     index: int
@@ -176,7 +183,8 @@ class CaseFile(CaseSection):
             along = float((np.array(stage.position) - first.position) @ direction)
             if abs(along - stage.indentation_mm) > MOST_APART_MM:
                 raise ValueError(
-                    f"stage {place} has indentation_mm {stage.indentation_mm:g}, but its position is {along:.2f} mm "
+                    f"stage {place} has indentation_mm {stage.indentation_mm:g}, but its position is "
+                    f"{along:.2f} mm "
                     f"from stage 0's along press_direction: correct one of them"
                 )
         return self
@@ -187,9 +195,10 @@ class BeadCase:
     """One experiment: float64, mm, in the frame of the organ's stress-free surface.
 
     ``beads`` (n, 3) stress-free, ``measured`` (stages, n, 3), ``poses`` (stages, 4, 4) world from probe,
-    ``indentation_mm`` (stages,), ``press_direction`` (3,) unit, ``size_mm`` (3,), ``gravity`` (3,) in mm/s^2. Unknown
-    material values are None. ``parts`` have their own material; tissue in the regions ``fixed`` does not move. ``probe_force_n``
-    (stages, 3) [N] is the tissue's force on the probe, NaN where unknown. ``digest`` is a hash of all files.
+    ``indentation_mm`` (stages,), ``press_direction`` (3,) unit, ``size_mm`` (3,), ``gravity`` (3,) in mm/s^2.
+    Unknown material values are None. ``parts`` have their own material; tissue in the regions ``fixed`` does
+    not move. ``probe_force_n`` (stages, 3) [N] is the tissue's force on the probe, NaN where unknown.
+    ``digest`` is a hash of all files.
     """
 
     name: str
@@ -277,7 +286,9 @@ def _surface(folder: Path, name: str) -> trimesh.Trimesh:
 
 
 def _read_beads(path: Path, stages: int) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Positions of the beads (n, 3) stress-free and (stages, n, 3) measured [mm], and their lines in the file (n,)."""
+    """Positions of the beads (n, 3) stress-free and (stages, n, 3) measured [mm], and their lines in the
+    file (n,).
+    """
     columns = [f"{axis}{stage}" for stage in ("", *range(stages)) for axis in "xyz"]
     values, lines = read_numbers(path, columns, CaseError)
     positions = values.reshape(len(values), stages + 1, 3).transpose(1, 0, 2)
@@ -290,14 +301,16 @@ def _check_beads(
     outside = signed_distance(organ.vertices, organ.faces, beads)[0]
     if outside.max() > 0:
         raise CaseError(
-            f"{path}: the bead on line {lines[outside.argmax()]} is {outside.max():.2f} mm outside the organ at x, y, z: "
+            f"{path}: the bead on line {lines[outside.argmax()]} is {outside.max():.2f} mm outside the organ "
+            "at x, y, z: "
             f"expected a place inside, in mm in the organ's frame"
         )
     moved = np.linalg.norm(measured - beads, axis=2)
     stage, bead = np.unravel_index(moved.argmax(), moved.shape)
     if moved.max() > organ.extents.max():
         raise CaseError(
-            f"{path}: the bead on line {lines[bead]} is {moved.max():.0f} mm from its stress-free place at stage {stage}: "
+            f"{path}: the bead on line {lines[bead]} is {moved.max():.0f} mm from its stress-free place at "
+            f"stage {stage}: "
             f"expected less than the organ's length, in mm in the organ's frame"
         )
 

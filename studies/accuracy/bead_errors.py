@@ -26,12 +26,16 @@ def bead_errors(case: BeadCase, beads: np.ndarray) -> np.ndarray:
 
 
 def null_errors(case: BeadCase) -> np.ndarray:
-    """Errors (stages, n) [mm] of predicting no motion: beads that stay where they were measured at stage 0."""
+    """Errors (stages, n) [mm] of predicting no motion: beads that stay where they were measured at stage
+    0.
+    """
     return np.linalg.norm(case.measured - case.measured[0], axis=2)
 
 
 def probe_distances(case: BeadCase) -> np.ndarray:
-    """Distances (stages, n) [mm] of the measured beads from the probe's surface at their stage; negative inside it."""
+    """Distances (stages, n) [mm] of the measured beads from the probe's surface at their stage; negative
+    inside it.
+    """
     box = RoundedBox(case.size_mm, case.edge_radius_mm)
     placed = zip(case.measured, case.poses, strict=True)
     return np.stack([box.gap((beads - pose[:3, 3]) @ pose[:3, :3]) for beads, pose in placed])
@@ -40,7 +44,8 @@ def probe_distances(case: BeadCase) -> np.ndarray:
 def stage_figures(
     indentation_mm: np.ndarray, errors: np.ndarray, null: np.ndarray
 ) -> list[dict[str, float | None]]:
-    """Each stage's mean, standard deviation (population), maximum and share of the probe's travel, if there is any.
+    """Each stage's mean, standard deviation (population), maximum and share of the probe's travel, if there
+    is any.
 
     ``indentation_mm`` (stages,), ``errors`` and ``null`` (stages, n) [mm].
     """
@@ -58,8 +63,8 @@ def stage_figures(
 
 
 def force_figures(case: BeadCase, run: BeadRun) -> list[dict[str, Any]]:
-    """Each stage's force of the tissue on the probe, simulated and measured, x, y, z [N], None where unknown; and the centroids of the
-    parts [mm].
+    """Each stage's force of the tissue on the probe, simulated and measured, x, y, z [N], None where unknown;
+    and the centroids of the parts [mm].
     """
     return [
         dict(
@@ -83,7 +88,9 @@ def correlation(first: np.ndarray, second: np.ndarray) -> float | None:
 
 
 def report(experiment: BeadExperiment, setup: Setup, run: BeadRun) -> dict:
-    """The figures of ``validate --json``; the correlation is over all beads at all stages with indentation."""
+    """The figures of ``validate --json``; the correlation is over all beads at all stages with
+    indentation.
+    """
     case = experiment.case
     errors = bead_errors(case, run.beads)
     return dict(
@@ -123,10 +130,11 @@ def summary(report: dict, model: str) -> str:
 
 
 def table(case: BeadCase, beads: np.ndarray) -> str:
-    """The paper's Tables 2 to 4 for one run's beads (stages, n, 3) [mm], beside the errors of predicting no motion.
+    """The paper's Tables 2 to 4 for one run's beads (stages, n, 3) [mm], beside the errors of predicting no
+    motion.
 
-    The last column is the correlation of error and distance from the probe at that stage; below are the errors by
-    distance.
+    The last column is the correlation of error and distance from the probe at that stage; below are the
+    errors by distance.
     """
     errors, null, distances = bead_errors(case, beads), null_errors(case), probe_distances(case)
     rows: list[list[Any]] = []
@@ -164,7 +172,8 @@ def _bands(distances: np.ndarray, errors: np.ndarray) -> list[str]:
     """Mean errors in bands of distance that hold equally many beads."""
     order = np.argsort(distances, kind="stable")
     return [
-        f"  {distances[band].min():5.1f} to {distances[band].max():5.1f} mm  {errors[band].mean():5.2f} mm on average, "
+        f"  {distances[band].min():5.1f} to {distances[band].max():5.1f} mm  {errors[band].mean():5.2f} "
+        "mm on average, "
         f"{errors[band].max():5.2f} at most ({len(band)} bead positions)"
         for band in np.array_split(order, DISTANCE_BANDS)
         if len(band)

@@ -22,7 +22,8 @@ from studies.accuracy.bead_case import DENSITY_KG_M3, BeadCase
 from studies.harness import positions_of
 from ultrasound.probe_manipulator import poses_between
 
-# Share of a stage's steps in which the probe moves; in the others the tissue comes to rest, as before the scan.
+# Share of a stage's steps in which the probe moves; in the others the tissue comes to rest, as before the
+# scan.
 MOVING = 2 / 3
 # Distance of the probe, back along the press, while the organ settles.
 AWAY_MM = 60.0
@@ -30,8 +31,10 @@ AWAY_MM = 60.0
 
 @dataclass
 class BeadRun:
-    """One run: ``beads`` (stages, n, 3) [mm] at the end of each stage, and ``arriving`` when the probe has just arrived; the tissue's
-    force on the probe ``force_n`` (stages, 3) [N], NaN for a model that has none, and the centroids ``parts_mm`` (stages, parts, 3) of the parts; the time of each step in the stages, and whether all positions are finite.
+    """One run: ``beads`` (stages, n, 3) [mm] at the end of each stage, and ``arriving`` when the probe has
+    just arrived; the tissue's force on the probe ``force_n`` (stages, 3) [N], NaN for a model that has none,
+    and the centroids ``parts_mm`` (stages, parts, 3) of the parts; the time of each step in the stages, and
+    whether all positions are finite.
     """
 
     beads: np.ndarray
@@ -45,7 +48,8 @@ class BeadRun:
 class BeadExperiment:
     """A case on the device, for setups that share model, size and material; Taichi must be initialised.
 
-    Positions on the device are relative to ``origin``, the middle of the organ. Raises SamplingError and SetupError.
+    Positions on the device are relative to ``origin``, the middle of the organ. Raises SamplingError and
+    SetupError.
     """
 
     def __init__(self, case: BeadCase, setup: Setup, rest: RestBody | None = None) -> None:
@@ -67,8 +71,9 @@ class BeadExperiment:
     def run(self, setup: Setup) -> BeadRun:
         """Press the organ from its stress-free shape.
 
-        It settles with the probe away: at stage 0 the probe would touch an organ that has not yet sunk into its support.
-        In each stage the probe moves at constant speed to its pose and rests. The same setup gives the same beads.
+        It settles with the probe away: at stage 0 the probe would touch an organ that has not yet sunk into
+        its support. In each stage the probe moves at constant speed to its pose and rests. The same setup
+        gives the same beads.
         """
         step = self.prepare(setup)
         pose = self._away()
@@ -123,7 +128,9 @@ class BeadExperiment:
         return moved
 
     def size(self, setup: Setup) -> dict[str, float]:
-        """Size of the model, under the names of a report: ``radius_mm`` or ``cell_mm``, ``particles`` or ``nodes``."""
+        """Size of the model, under the names of a report: ``radius_mm`` or ``cell_mm``, ``particles`` or
+        ``nodes``.
+        """
         return {setup.tissue.size_key: setup.size_mm, **self.model.counts()}
 
     def describe(self, setup: Setup) -> str:

@@ -1,4 +1,6 @@
-"""The paper's calibration: a search for the settings with the least mean bead error, judged on held-out data."""
+"""The paper's calibration: a search for the settings with the least mean bead error, judged on held-out
+data.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -22,7 +24,8 @@ QUARTIC = 4
 # stiffness, over-relaxation and iterations, with Eq. 7's range for the second.
 BOUNDS = ((0.05, 1.0), (1.0, 2.0), (3, 30))
 POPULATION = 5
-# A larger error, in multiples of the least, is that of a body that falls apart; it is left out of the quartic fit.
+# A larger error, in multiples of the least, is that of a body that falls apart; it is left out of the quartic
+# fit.
 MOST_ERROR = 4.0
 
 
@@ -79,14 +82,17 @@ class Calibration:
         return self.split.held_out_mm([null_errors(case) for case in self.cases])
 
     def exhaustive(self, radii_mm: Sequence[float], spacing: float) -> None:
-        """The paper's search: every stiffness on a grid for each radius, then on a finer grid around the best of each."""
+        """The paper's search: every stiffness on a grid for each radius, then on a finer grid around the
+        best of each.
+        """
         grid = stiffness_grid(spacing)
         self._try_all([setup_of(MODEL, radius_mm=r, stiffness=a) for r in radii_mm for a in grid])
         finer = {r: finer_grid(self.best(r).setup.tissue.stiffness, spacing) for r in radii_mm}
         self._try_all([setup_of(MODEL, radius_mm=r, stiffness=a) for r in radii_mm for a in finer[r]])
 
     def search(self, radii_mm: Sequence[float], generations: int) -> None:
-        """Stiffness, over-relaxation and iterations of each radius, by differential evolution from a fixed seed.
+        """Stiffness, over-relaxation and iterations of each radius, by differential evolution from a fixed
+        seed.
 
         A generation is evaluated at once, so the result does not depend on the number of workers.
         """
@@ -114,7 +120,9 @@ class Calibration:
             )
 
     def _try_all(self, setups: Sequence[Setup]) -> list[CalibrationTrial]:
-        """Evaluate setups on every case; case by case, as a worker keeps what it has built for a case and a radius."""
+        """Evaluate setups on every case; case by case, as a worker keeps what it has built for a case and
+        a radius.
+        """
         results = []
         for result in self.workers([(case, setup) for case in self.cases for setup in setups]):
             results.append(result)
@@ -132,7 +140,10 @@ class Calibration:
 
 
 def split_of(cases: Sequence[BeadCase], hold_out: str) -> Split:
-    """Hold out each case's deepest stage, every third of its beads, or the last case. Raises CalibrationError."""
+    """Hold out each case's deepest stage, every third of its beads, or the last case.
+
+    Raises CalibrationError.
+    """
     if len({case.digest for case in cases}) < len(cases):
         raise CalibrationError("a case is named twice: fitted data would be held out as well; name each once")
     masks: list[np.ndarray] = [np.ones(case.measured.shape[:2], bool) for case in cases]
@@ -179,7 +190,8 @@ def search_count(cases: int, radii: int, generations: int) -> int:
 
 
 def quartic(trials: Sequence[CalibrationTrial]) -> tuple[Polynomial, float] | None:
-    """The paper's smooth curve through the errors up to MOST_ERROR times the least, over its ``domain``, and its best stiffness.
+    """The paper's smooth curve through the errors up to MOST_ERROR times the least, over its ``domain``, and
+    its best stiffness.
 
     None where there are too few.
     """

@@ -1,4 +1,6 @@
-"""Results of a calibration: the paper's Tables 2 to 5 and Figures 4 and 5, the course of a search, and JSON with all trials."""
+"""Results of a calibration: the paper's Tables 2 to 5 and Figures 4 and 5, the course of a search, and
+JSON with all trials.
+"""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
@@ -24,7 +26,9 @@ Row = list[float | None]
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of names and one figure a radius; ``shares``, where given, are the figures as % of the probe's travel."""
+    """Rows of names and one figure a radius; ``shares``, where given, are the figures as % of the probe's
+    travel.
+    """
 
     name: str
     title: str
@@ -187,7 +191,9 @@ def _cell(figure: float | None, share: float | None) -> str:
 
 
 def write_figure4(calibration: Calibration, path: Path) -> None:
-    """Mean error over the stiffness for each radius, fitted and held out; quartics with a ring at the minimum."""
+    """Mean error over the stiffness for each radius, fitted and held out; quartics with a ring at the
+    minimum.
+    """
     figure, left, right = _two_panels(calibration)
     for colour, radius in zip(_colours(calibration), calibration.trials, strict=True):
         trials = sorted(calibration.trials[radius], key=lambda trial: trial.setup.tissue.stiffness)

@@ -17,12 +17,14 @@ HEAD = "Convergence study: displacement of the beads by a change, mean at each s
 def changes_of(setup: Setup) -> dict[str, Setup]:
     """The changed setups by name; in a converged solution none of them moves the beads.
 
-    With half the time step the press has the same duration. Raises SetupError where a changed value is out of range.
+    With half the time step the press has the same duration. Raises SetupError where a changed value is out of
+    range.
     """
     pieces = setup.tissue.piece_name
     if not LEAST_MM <= setup.size_mm <= MOST_MM:
         raise SetupError(
-            f"--check: {pieces} a third larger and smaller need {option_of(setup.tissue.size_key)} from {LEAST_MM:g} to {MOST_MM:g}"
+            f"--check: {pieces} a third larger and smaller need {option_of(setup.tissue.size_key)} from "
+            f"{LEAST_MM:g} to {MOST_MM:g}"
         )
     if setup.iterations > MOST_ITERATIONS:
         raise SetupError(f"--check: twice the iterations needs --iterations of {MOST_ITERATIONS} at most")

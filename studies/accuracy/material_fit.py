@@ -1,9 +1,10 @@
-"""Estimation of the material from bead experiments: moduli, Poisson's ratio and friction by nonlinear least squares.
+"""Estimation of the material from bead experiments: moduli, Poisson's ratio and friction by nonlinear least
+squares.
 
-The residuals are positions of the beads and, where a case has them, forces on the probe. The confidence intervals are those of the
-linearised model (Seber & Wild 2003, Sec. 5.1). The residuals of a computation are not random: neighbouring beads are off alike, so that
-each stage counts as three independent observations only, one for each axis. A parameter whose interval is wide, or that ends at a
-bound, is not determined.
+The residuals are positions of the beads and, where a case has them, forces on the probe. The confidence
+intervals are those of the linearised model (Seber & Wild 2003, Sec. 5.1). The residuals of a computation are
+not random: neighbouring beads are off alike, so that each stage counts as three independent observations
+only, one for each axis. A parameter whose interval is wide, or that ends at a bound, is not determined.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,7 +24,8 @@ from studies.accuracy.bead_case import BeadCase
 from studies.accuracy.bead_experiment import BeadExperiment
 from studies.study_results import text_table
 
-# What a bead's position and a force are known to, and the elements are off by: the residuals are in these units.
+# What a bead's position and a force are known to, and the elements are off by: the residuals are in these
+# units.
 BEAD_MM, FORCE_SHARE, LEAST_FORCE_N = 0.1, 0.03, 0.03
 # A wider half of an interval, relative to the value, means that the data do not determine it.
 MOST_UNCERTAIN = 0.25
@@ -63,7 +65,9 @@ class Fitted:
 
 @dataclass(frozen=True)
 class MaterialFit:
-    """The parameters as found, places (p,) in the search, with half of their 95 % intervals (p,), and how well they fit."""
+    """The parameters as found, places (p,) in the search, with half of their 95 % intervals (p,), and how
+    well they fit.
+    """
 
     parameters: list[Fitted]
     place: np.ndarray
@@ -89,7 +93,9 @@ class MaterialFit:
 
 
 def parameters_of(cases: Sequence[BeadCase]) -> list[Fitted]:
-    """What is estimated: modulus and Poisson's ratio outside the parts, the modulus of each part, friction."""
+    """What is estimated: modulus and Poisson's ratio outside the parts, the modulus of each part,
+    friction.
+    """
     table = mechanical_properties().parts
     found = [_young("modulus", table["kidney"].young_kpa)]
     for name in dict.fromkeys(part.name for case in cases for part in case.parts):
@@ -186,7 +192,9 @@ class _Search:
 
 
 def residuals_of(case: BeadCase, setup: Setup, values: dict[str, float]) -> np.ndarray:
-    """Residuals of one case: beads in units of BEAD_MM, then known forces in units of what they are known to."""
+    """Residuals of one case: beads in units of BEAD_MM, then known forces in units of what they are known
+    to.
+    """
     usual = setup.but(young_kpa=15.0, poisson=0.45)
     key = "material fit", case.digest, setup.size_mm
     experiment = built_once(key, lambda: BeadExperiment(case, usual))
@@ -226,4 +234,7 @@ def table(report: dict[str, Any]) -> str:
         for each in report["parameters"]
     ]
     figures = text_table(("parameter", "found", "95 % from", "to", ""), rows, ("", ".3g", ".3g", ".3g", ""))
-    return f"{figures}\n\nThe beads are {report['bead_rms_mm']:.3f} mm off (root mean square); {report['presses']} presses"
+    return (
+        f"{figures}\n\nThe beads are {report['bead_rms_mm']:.3f} mm off (root mean square); "
+        f"{report['presses']} presses"
+    )

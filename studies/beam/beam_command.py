@@ -18,8 +18,8 @@ from studies.study_options import number_option
 
 BEAM = "beam.stl"
 DPI = 110
-# Tip markers are balls at this distance from the surface at the free end: on top, on one side, on the other, at these
-# shares of height and width (as in the simulation of the recordings' authors).
+# Tip markers are balls at this distance from the surface at the free end: on top, on one side, on the other,
+# at these shares of height and width (as in the simulation of the recordings' authors).
 STAND_OFF_MM = 6.0
 MARKERS = np.array([[1.0, 0.5], [0.8, 1.0], [0.2, 0.0]])
 OUTWARD = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
@@ -51,7 +51,8 @@ def beam(
 ) -> None:
     """Compare with the silicone beam of FOLDER (motion capture).
 
-    The beam (beam.stl) is clamped and loaded; compared are the rest position of its tip and its first frequency.
+    The beam (beam.stl) is clamped and loaded; compared are the rest position of its tip and its first
+    frequency.
     """
     captures = load_captures(folder)
     size = beam_size(folder)
@@ -85,7 +86,8 @@ def beam(
     for row in rows:
         if row["rest_left_mm"] > REST_TOLERANCE_MM:
             click.echo(
-                f"{row['load_g']:.0f} g: not quite at rest, it moved {row['rest_left_mm']:.3f} mm in the last iterations"
+                f"{row['load_g']:.0f} g: not quite at rest, it moved {row['rest_left_mm']:.3f} mm in the "
+                "last iterations"
             )
     if checked:
         for first_or_last in sorted({0, len(rows) - 1}):

@@ -35,7 +35,8 @@ COLUMNS = (
 def theory(size_mm: np.ndarray, material: BeamMaterial, load_g: float) -> tuple[float, float]:
     """Sag [mm] of a Timoshenko cantilever, frequency [Hz] of an Euler-Bernoulli one with a mass at its tip.
 
-    Small deflections, a clamped end that is free to change its width; the frequency is without shear and rotary inertia.
+    Small deflections, a clamped end that is free to change its width; the frequency is without shear and
+    rotary inertia.
     """
     height, width, length = 1e-3 * np.asarray(size_mm, float)
     young = 1e3 * material.young_kpa
@@ -58,11 +59,13 @@ def theory(size_mm: np.ndarray, material: BeamMaterial, load_g: float) -> tuple[
 def compare(
     captures: list[Capture], build: Callable[..., Cantilever], cell_mm: float
 ) -> tuple[dict[str, Any], np.ndarray]:
-    """One load's row, and time [s] and computed height [mm] of the markers after the release, shape (2, frames).
+    """One load's row, and time [s] and computed height [mm] of the markers after the release, shape (2,
+    frames).
 
-    ``build`` makes a beam from a cell width and a load; the rest position is computed on cells of half the width. In the row are
-    lengths of the tip's final displacement [mm] and first frequencies [Hz]; measurement errors cover the repeats;
-    ``rest_left_mm`` is the change of the computed rest position when its iterations were doubled.
+    ``build`` makes a beam from a cell width and a load; the rest position is computed on cells of half the
+    width. In the row are lengths of the tip's final displacement [mm] and first frequencies [Hz]; measurement
+    errors cover the repeats; ``rest_left_mm`` is the change of the computed rest position when its iterations
+    were doubled.
     """
     load_g = captures[0].load_g
     beam = build(cell_mm=cell_mm, load_g=load_g)
@@ -109,7 +112,9 @@ def computed_oscillation(beam: Cantilever, trace: np.ndarray) -> Oscillation:
 
 
 def mean_length(displacement_mm: np.ndarray) -> float:
-    """Mean length [mm] of the markers' displacements (n, 3); independent of the frames of capture and beam."""
+    """Mean length [mm] of the markers' displacements (n, 3); independent of the frames of capture and
+    beam.
+    """
     return float(np.linalg.norm(displacement_mm, axis=1).mean())
 
 
@@ -135,7 +140,8 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def check(build: Callable[..., Cantilever], cell_mm: float, load_g: float, time_s: np.ndarray) -> str:
-    """Convergence study: frequency against time step and iterations; frequency and rest against cells, material and load.
+    """Convergence study: frequency against time step and iterations; frequency and rest against cells,
+    material and load.
 
     Args:
         build: makes a beam from a cell width, a load, a material and the height at which the load hangs.

@@ -16,9 +16,9 @@ from sim.solver import Solver, StepSettings
 from studies.beam.motion_capture import BeamError
 
 GRAVITY_MM_S2 = 9810.0
-# Cells that a pressure wave crosses in a time step. With more, some ten iterations do not balance it and the energy
-# grows. At Poisson's ratio 0.499 on 10 mm cells such a step is 0.05 ms, and rounding in float32 lowers the frequency
-# by 0.3% (0.8% with half that step).
+# Cells that a pressure wave crosses in a time step. With more, some ten iterations do not balance it and the
+# energy grows. At Poisson's ratio 0.499 on 10 mm cells such a step is 0.05 ms, and rounding in float32 lowers
+# the frequency by 0.3% (0.8% with half that step).
 CELLS_A_STEP = 1.0
 ITERATIONS = 20
 # At rest: iterations of one step without inertia, doubled until the tip moves less than REST_TOLERANCE_MM.
@@ -28,8 +28,8 @@ REST_TOLERANCE_MM = 0.005
 MOST_REST_ITERATIONS = 256_000
 # The beam may differ from a whole number of cells by this.
 WHOLE_MM = 0.01
-# With a higher Poisson's ratio the search starts from the rest position at this one, with HARD_ITERATIONS: the tip
-# moves slowly at first.
+# With a higher Poisson's ratio the search starts from the rest position at this one, with HARD_ITERATIONS:
+# the tip moves slowly at first.
 EASY_POISSON = 0.49
 HARD_ITERATIONS = 16_000
 
@@ -51,8 +51,9 @@ class BeamMaterial:
 class Cantilever:
     """A beam of size_mm (height, width, length), clamped at length 0; gravity is against the first axis.
 
-    load_g hangs along the upper edge of the free end, or across it at hung_mm above the lower. Markers (n, 3) [mm]
-    outside the beam stand on its nearest point and turn with its end. Raises BeamError when the cells do not fill it.
+    load_g hangs along the upper edge of the free end, or across it at hung_mm above the lower. Markers (n, 3)
+    [mm] outside the beam stand on its nearest point and turn with its end. Raises BeamError when the cells do
+    not fill it.
     """
 
     def __init__(
@@ -71,7 +72,8 @@ class Cantilever:
         counts = np.round(size / cell_mm).astype(int)
         if np.abs(counts * cell_mm - size).max() > WHOLE_MM:
             raise BeamError(
-                f"a beam of {size[0]:g} x {size[1]:g} x {size[2]:g} mm is no whole number of {cell_mm:g} mm cells"
+                f"a beam of {size[0]:g} x {size[1]:g} x {size[2]:g} mm is no whole number of {cell_mm:g} mm "
+                "cells"
             )
         lattice = fill_block(tuple(counts), cell_mm)
         self.cell_mm = cell_mm
@@ -85,7 +87,8 @@ class Cantilever:
         load = np.bincount(node.ravel(), load_g / len(line) * share.ravel(), len(lattice.nodes))
         fixed = lattice.nodes[:, 2] < 1e-6 * size[2]
         self.body = Body(lattice.nodes)
-        # 1 + nu is the exact hourglass stiffness of bending, of which a beam a few elements thick has much inside them.
+        # 1 + nu is the exact hourglass stiffness of bending, of which a beam a few elements thick has much
+        # inside them.
         tissue = Material(material.young_kpa, material.poisson, material.density_g_cm3)
         self.model = NeoHookean(
             self.body,
@@ -116,7 +119,9 @@ class Cantilever:
         return StepSettings(stabilisation_iterations=0, damping=0.0, gravity=gravity, **changes)
 
     def rest(self) -> tuple[np.ndarray, float]:
-        """Marker displacements (n, 3) [mm] at rest, from the straight beam, and their change [mm] in the last half of the iterations."""
+        """Marker displacements (n, 3) [mm] at rest, from the straight beam, and their change [mm] in the
+        last half of the iterations.
+        """
         self.body.restore(self.body.rest_state())
         if self.material.poisson > EASY_POISSON:
             self.model.set_material(self.material.young_kpa, EASY_POISSON)
@@ -126,7 +131,9 @@ class Cantilever:
         return self._settle(REST_ITERATIONS)
 
     def _settle(self, iterations: int) -> tuple[np.ndarray, float]:
-        """Over-relaxed steps of 1 s, in which inertia is negligible, each with as many iterations as all before it."""
+        """Over-relaxed steps of 1 s, in which inertia is negligible, each with as many iterations as all
+        before it.
+        """
         total, left = 0, np.inf
         before = self.displacement()
         while left > REST_TOLERANCE_MM and total < MOST_REST_ITERATIONS:
@@ -146,7 +153,9 @@ class Cantilever:
     def swing(
         self, frames: int, frame_s: float, substeps: int | None = None, iterations: int | None = None
     ) -> np.ndarray:
-        """Marker displacements (frames + 1, n, 3) [mm] after a release from straight, the first at the release."""
+        """Marker displacements (frames + 1, n, 3) [mm] after a release from straight, the first at the
+        release.
+        """
         self.body.restore(self.body.rest_state())
         substeps = substeps or self.substeps(frame_s)
         steps = -(-substeps // MOST_SUBSTEPS)

@@ -23,7 +23,8 @@ FALLEN_MM = 0.5
 # Frames averaged before the release and at rest.
 HELD_FRAMES = 10
 REST_FRAMES = 50
-# The frequency is fitted in windows of WINDOW_PERIODS, one period apart; LEAST_SWING separates peaks from noise.
+# The frequency is fitted in windows of WINDOW_PERIODS, one period apart; LEAST_SWING separates peaks from
+# noise.
 WINDOW_PERIODS = 2.0
 WINDOWS = 3
 LEAST_SWING = 0.1
@@ -74,7 +75,10 @@ def load_captures(folder: Path) -> list[Capture]:
 
 
 def read_capture(path: Path) -> Capture:
-    """One recording; its name gives the load, such as ``beam_gravity_a`` or ``beam_load52_a``. Raises BeamError."""
+    """One recording; its name gives the load, such as ``beam_gravity_a`` or ``beam_load52_a``.
+
+    Raises BeamError.
+    """
     load = re.search(r"load(\d+)", path.stem)
     if load is None and "gravity" not in path.stem:
         raise BeamError(f"{path}: its name has neither 'gravity' nor 'load' and grams, such as load52")
@@ -95,8 +99,9 @@ def read_capture(path: Path) -> Capture:
 def oscillation(time_s: np.ndarray, height_mm: np.ndarray) -> Oscillation:
     """First frequency and damping after a release at the start of the signal. Raises BeamError.
 
-    A damped cosine about a slowly sinking mean (silicone creeps) is fitted in windows of two periods, one period
-    apart, from a quarter of a period after the release; the error is the spread of the frequency over the windows.
+    A damped cosine about a slowly sinking mean (silicone creeps) is fitted in windows of two periods, one
+    period apart, from a quarter of a period after the release; the error is the spread of the frequency over
+    the windows.
     """
     period = _period(time_s, height_mm)
     fits = []

@@ -62,7 +62,8 @@ def cohort(
 ) -> None:
     """Settle, press and plan for each patient, in one table.
 
-    FOLDER... are patients' folders or scene files. Started again with the same --out, it goes on where it was interrupted.
+    FOLDER... are patients' folders or scene files. Started again with the same --out, it goes on where it was
+    interrupted.
     """
     folders = without_system_files(folders)
     make_folder(out)
@@ -138,7 +139,9 @@ class CohortStudy:
         return row.model_copy(update=_figures(result))
 
     def _write(self, row: PatientRow) -> None:
-        """Write the table with one row more; rows of patients that are not reached yet, or of another command line, stay."""
+        """Write the table with one row more; rows of patients that are not reached yet, or of another
+        command line, stay.
+        """
         self._rows.append(row)
         reached = {each.key for each in self._rows}
         kept = [each for each in read_rows(self.out) if each.state != "failed" and each.key not in reached]
@@ -152,8 +155,8 @@ def in_workers(
 ) -> Iterator[tuple[CohortPatient, Future]]:
     """Each patient and the future of the result, as soon as it has ended.
 
-    Where a process is ended, those that were in work are computed again, each alone: one who takes too much memory does not
-    cost the others their results. Raises WorkerError.
+    Where a process is ended, those that were in work are computed again, each alone: one who takes too much
+    memory does not cost the others their results. Raises WorkerError.
     """
     left = iter(patients)
     while True:
@@ -236,7 +239,9 @@ def _figures(result: PatientResult) -> dict[str, object]:
 
 
 def _message_of(error: BaseException, folder: Path) -> str:
-    """What is wrong with a patient, in one line without paths: the table may be read by others, and a path may name the patient."""
+    """What is wrong with a patient, in one line without paths: the table may be read by others, and a path
+    may name the patient.
+    """
     text = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
     places = [folder.absolute(), folder.resolve(), folder]
     if folder.suffix == ".toml":

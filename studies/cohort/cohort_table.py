@@ -20,8 +20,8 @@ class CohortError(UserError):
 class PatientRow(BaseModel):
     """One patient: lengths in mm, volumes in ml, force in N, times in s; None for what there is not.
 
-    ``key`` tells patient, scene, program and settings apart, and names the folder of report and plan. Of the press, figures are
-    at its greatest depth; of the plan, of its first sweep.
+    ``key`` tells patient, scene, program and settings apart, and names the folder of report and plan. Of the
+    press, figures are at its greatest depth; of the plan, of its first sweep.
     """
 
     model_config = ConfigDict(extra="forbid")

@@ -37,7 +37,8 @@ QUANTITIES = {
 def echo(out: Path) -> None:
     """Compare the B-mode image with an independent wave simulator.
 
-    Virtual test objects are imaged with each included probe, and the same arrays are simulated by SIMUS (package pymust). Two minutes.
+    Virtual test objects are imaged with each included probe, and the same arrays are simulated by SIMUS
+    (package pymust). Two minutes.
     """
     pymust()
     make_folder(out)
@@ -46,8 +47,10 @@ def echo(out: Path) -> None:
     described = [_described(row) for row in found]
     outside = sum(not row.is_within for row in found)
     text = (
-        f"{table_of(COLUMNS, described)}\n\n{len(found) - outside} of {len(found)} within {100 * WIDTH_BAR:g} % "
-        f"(lengths) or {LEVEL_BAR_DB:g} dB (levels) of SIMUS, or {100 * SHIFT_BAR:g} % of the Doppler equation"
+        f"{table_of(COLUMNS, described)}\n\n{len(found) - outside} of {len(found)} within "
+        f"{100 * WIDTH_BAR:g} % "
+        f"(lengths) or {LEVEL_BAR_DB:g} dB (levels) of SIMUS, or {100 * SHIFT_BAR:g} % of the Doppler "
+        "equation"
     )
     report = dict(
         backend=backend,

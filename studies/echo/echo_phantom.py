@@ -26,7 +26,9 @@ Values = float | np.ndarray | Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 class EchoPhantom:
-    """Tissue whose properties are functions of u and v of the image plane [mm], the same across it, filled anew for each image."""
+    """Tissue whose properties are functions of u and v of the image plane [mm], the same across it, filled
+    anew for each image.
+    """
 
     def __init__(self, probe: Probe, pixels: int = PIXELS) -> None:
         self.probe = probe
@@ -53,7 +55,9 @@ class EchoPhantom:
         self.bmode.sound.surface = surface
 
     def vessel_velocity(self, speed_cm_s: float, angle_deg: float, depth_mm: float) -> np.ndarray:
-        """Return the velocities [cm/s] that Doppler finds in a straight vessel whose flow has an angle to the direction of the array."""
+        """Return the velocities [cm/s] that Doppler finds in a straight vessel whose flow has an angle to
+        the direction of the array.
+        """
         turn = np.radians(angle_deg)
         along = np.array([np.sin(turn), -np.cos(turn)])
         off = np.abs(self.u * along[1] - (self.v - depth_mm) * along[0])
@@ -89,7 +93,9 @@ class EchoPhantom:
         detail_level: DetailLevel = "speckle",
         probe: Probe | None = None,
     ) -> np.ndarray:
-        """Return the echo (scanlines, samples) without gain, of a probe that is moved out of its image plane."""
+        """Return the echo (scanlines, samples) without gain, of a probe that is moved out of its image
+        plane.
+        """
         probe = probe or self.probe
         place = np.array([0.0, 0.0, across_mm])
         pose = pose_at(place, np.array([0.0, 1, 0]), np.array([1.0, 0, 0]), probe.housing_mm[2])
@@ -98,7 +104,9 @@ class EchoPhantom:
         return 10 ** ((array_of(self.bmode.decibel).astype(float) - probe.gain_db()) / 20)
 
     def point_response(self, scanline: int, depth_mm: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return distance [mm] along an arc and amplitude on each scanline of a point scatterer on one of them."""
+        """Return distance [mm] along an arc and amplitude on each scanline of a point scatterer on one of
+        them.
+        """
         self.fill()
         self.amplitude()
         spacing = float(self.probe.line_spacing_mm(np.array([depth_mm]))[0])

@@ -1,4 +1,6 @@
-"""What ``study echo`` compares: the B-mode image of a virtual test object with SIMUS, quantity by quantity."""
+"""What ``study echo`` compares: the B-mode image of a virtual test object with SIMUS, quantity by
+quantity.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -32,7 +34,10 @@ ROUGH = Surface(roughness_mm=0.03, slope=0.14, scattered=0.0, scattered_hard=0.0
 # Correlation length of a rough surface of that slope, and draws of it.
 ROUGH_LENGTH_MM, DRAWS = float(np.sqrt(2) * 0.03 / 0.14), 100
 SEED = 20181029
-NEAR_FIELD = "pymust counts the phase of the distance across the plane twice; this matters away from the elevation focus"
+NEAR_FIELD = (
+    "pymust counts the phase of the distance across the plane twice; this matters away from the "
+    "elevation focus"
+)
 INVISIBLE = "no scanner shows it: below the speckle behind it"
 
 
@@ -217,7 +222,9 @@ def interfaces(phantom: EchoPhantom, name: str) -> Iterator[Row]:
 
 
 def cysts(phantom: EchoPhantom, name: str) -> Iterator[Row]:
-    """Level in the middle of an anechoic cylinder across the image plane, relative to the tissue around it."""
+    """Level in the middle of an anechoic cylinder across the image plane, relative to the tissue around
+    it.
+    """
     beam, draw, count = _beam(phantom.probe, False), np.random.default_rng(SEED), CYST_POINTS
     for depth in DEPTHS_MM[name]:
         phantom.fill(backscatter=0.1 * (np.hypot(phantom.u, phantom.v - depth) > CYST_RADIUS_MM))

@@ -1,8 +1,10 @@
-"""A scanline simulated by SIMUS (Garcia 2022, Comput Methods Programs Biomed 218, 106726), package ``pymust``: the reference.
+"""A scanline simulated by SIMUS (Garcia 2022, Comput Methods Programs Biomed 218, 106726), package
+``pymust``: the reference.
 
-SIMUS multiplies the fields of the transmit and of the receive aperture at each scatterer, frequency by frequency; so the echo of many
-scatterers, one by one, takes two calls of its ``pfield``. It has the same array as the probe: elements, pitch, bandwidth, one cycle, no
-apodization, the apertures of ``half_apertures_mm``.
+SIMUS multiplies the fields of the transmit and of the receive aperture at each scatterer, frequency by
+frequency; so the echo of many scatterers, one by one, takes two calls of its ``pfield``. It has the same
+array as the probe: elements, pitch, bandwidth, one cycle, no apodization, the apertures of
+``half_apertures_mm``.
 """
 
 from typing import Any
@@ -56,7 +58,9 @@ class SimusBeam:
     def points(
         self, along_mm: np.ndarray, depth_mm: np.ndarray | float, across_mm: np.ndarray | float = 0.0
     ) -> np.ndarray:
-        """Return points (n, 3) beside the scanline: lateral along an arc, depth and out of the image plane [mm]."""
+        """Return points (n, 3) beside the scanline: lateral along an arc, depth and out of the image plane
+        [mm].
+        """
         along, depth, across = np.broadcast_arrays(along_mm, depth_mm, across_mm)
         if self.probe.sector is None:
             return np.column_stack([self.place + along, across, depth])
@@ -69,7 +73,8 @@ class SimusBeam:
     def echoes(
         self, points: np.ndarray, depth_mm: float, attenuation_db_cm_mhz: float = 0.0, window_mm: float = 6.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return depths [mm] around that of reception, and the complex echo of each point (n, 3) there, (n, depths).
+        """Return depths [mm] around that of reception, and the complex echo of each point (n, 3) there, (n,
+        depths).
 
         Points must be within the window around the depth, as later echoes overlap.
         """
@@ -92,7 +97,9 @@ class SimusBeam:
     def _spectrum(
         self, points: np.ndarray, half_mm: float, focus_mm: float, step_hz: float, attenuation: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return frequencies [Hz] and the field (frequencies, n) at points of an aperture focused on the scanline."""
+        """Return frequencies [Hz] and the field (frequencies, n) at points of an aperture focused on the
+        scanline.
+        """
         probe = self.probe
         chosen = self.elements
         if not self.is_phased:
@@ -130,7 +137,9 @@ class SimusBeam:
     def _in_aperture(
         self, points: np.ndarray, chosen: np.ndarray, middle: float, focus_mm: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
-        """Return x, y, z of points, focus (2,) and elements (e, 2) in the axes of an aperture as SIMUS has them, and its radius."""
+        """Return x, y, z of points, focus (2,) and elements (e, 2) in the axes of an aperture as SIMUS has
+        them, and its radius.
+        """
         x, y, z = points.T.astype(float)
         radius = self.probe.radius_mm
         if not radius:
@@ -148,7 +157,8 @@ class SimusBeam:
 
 
 def half_correlation(echoes: np.ndarray, step_mm: float) -> float:
-    """Return the shift [mm] at which speckle intensity correlates by 1/2, of echoes (n, t) of points at even steps.
+    """Return the shift [mm] at which speckle intensity correlates by 1/2, of echoes (n, t) of points at even
+    steps.
 
     The correlation is that of the echo with itself (Wagner 1983).
     """

@@ -1,4 +1,6 @@
-"""Each backend's cases in a process of its own, so that a driver that crashes or hangs ends that process alone."""
+"""Each backend's cases in a process of its own, so that a driver that crashes or hangs ends that process
+alone.
+"""
 
 import multiprocessing
 import os
@@ -17,7 +19,9 @@ CasesOf = Callable[[str], dict[str, Case]]
 
 @dataclass
 class BackendRun:
-    """What was measured on a backend, and by case what was not and why; ``reason``: why it ended before the last of them; ``ended``: how many did."""
+    """What was measured on a backend, and by case what was not and why; ``reason``: why it ended before
+    the last of them; ``ended``: how many did.
+    """
 
     backend: str
     measured: list[CaseFigures] = field(default_factory=list)
@@ -64,7 +68,9 @@ def run_backend(
 def _measure(
     connection: Connection, backend: str, tries_refused: bool, cases_of: CasesOf, parent: int
 ) -> None:
-    """In the process: send ("measured", CaseFigures) for each, ("ended", fault or "") after each case, or ("refused", why)."""
+    """In the process: send ("measured", CaseFigures) for each, ("ended", fault or "") after each case, or
+    ("refused", why).
+    """
     end_with_parent(parent)
     try:
         start(backend, accepts_wrong_results=tries_refused)

@@ -84,7 +84,9 @@ def _runs(seconds: float, try_refused: bool) -> Iterator[BackendRun]:
 
 
 def row(backend: str, measured: CaseFigures, reference: dict[str, CaseFigures]) -> dict[str, Any]:
-    """The figures of a case; how far from the processor's its results are is None for the processor, and for what has no such result."""
+    """The figures of a case; how far from the processor's its results are is None for the processor, and
+    for what has no such result.
+    """
     apart: dict[str, Any] = dict.fromkeys(
         ("beads_apart_mm", "force_apart_percent", "grey_apart", "grey_share_percent")
     )
@@ -103,7 +105,9 @@ def row(backend: str, measured: CaseFigures, reference: dict[str, CaseFigures]) 
 
 
 def differences(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> dict[str, float]:
-    """Largest distance of a bead [mm]; of a force, in % of the largest; of a grey level, and how many pixels [%] differ by more than one level."""
+    """Largest distance of a bead [mm]; of a force, in % of the largest; of a grey level, and how many
+    pixels [%] differ by more than one level.
+    """
     apart = {}
     for name in found.keys() & expected.keys():
         # Grey levels are unsigned.
@@ -137,7 +141,8 @@ def text_of(report: dict[str, Any]) -> str:
     """The table, what was not measured, and what is not as asked."""
     devices = ", ".join(report["vulkan_devices"]) or "none"
     lines = [
-        f"{report['cores']} cores; Vulkan devices: {devices}. Differences are from the processor's results.\n",
+        f"{report['cores']} cores; Vulkan devices: {devices}. Differences are from the processor's "
+        "results.\n",
         table_of(COLUMNS.items(), report["rows"]),
     ]
     if report["not_measured"]:

@@ -1,4 +1,6 @@
-"""The sheet of a patient and a probe: of each standard plane the CT, its labels, the classes of its voxels and the B-mode image."""
+"""The sheet of a patient and a probe: of each standard plane the CT, its labels, the classes of its voxels
+and the B-mode image.
+"""
 
 from collections.abc import Mapping, Sequence
 from io import BytesIO
@@ -62,7 +64,9 @@ def write_sheet(patient: ImagedPatient, scans: Sequence[PlaneScan], title: str, 
 
 
 def sheet_figure(patient: ImagedPatient, scans: Sequence[PlaneScan], title: str) -> "Figure":
-    """Return the sheet as a figure: a column for each plane; rows for CT, labels, classes and B-mode image."""
+    """Return the sheet as a figure: a column for each plane; rows for CT, labels, classes and B-mode
+    image.
+    """
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
@@ -97,7 +101,9 @@ def classes_of(patient: ImagedPatient, scan: PlaneScan) -> np.ndarray:
 
 
 def labels_of(patient: ImagedPatient, scan: PlaneScan) -> np.ndarray:
-    """Return the names of the labels (rows, columns) at a scan's pixels, before what is not labelled is classified."""
+    """Return the names of the labels (rows, columns) at a scan's pixels, before what is not labelled is
+    classified.
+    """
     anatomy = patient.anatomy
     return _names_at(anatomy.labels, anatomy.tissues, anatomy.index_from_mm, scan)
 

@@ -1,7 +1,8 @@
 """An outline of the kidney in a B-mode image, by a segmenter that knows only where its centre is.
 
-The outline is a minimal path (Cohen and Kimmel 1997, Int J Comput Vis 24, 57; scikit-image) once around the centre, in polar coordinates. Steps
-between darker within and brighter beyond cost least, so that it keeps to the kidney's border and bridges what is hidden of it.
+The outline is a minimal path (Cohen and Kimmel 1997, Int J Comput Vis 24, 57; scikit-image) once around the
+centre, in polar coordinates. Steps between darker within and brighter beyond cost least, so that it keeps to
+the kidney's border and bridges what is hidden of it.
 """
 
 from collections.abc import Sequence
@@ -10,16 +11,20 @@ import numpy as np
 from scipy import ndimage
 from skimage.graph import route_through_array
 
-# The outline is so far from the centre: half of the thickness of a kidney is 20 to 30 mm, half of its length 50 to 60 mm.
+# The outline is so far from the centre: half of the thickness of a kidney is 20 to 30 mm, half of its length
+# 50 to 60 mm.
 LEAST_MM, MOST_MM = 12, 60
-# Most that is so near to the centre is parenchyma. What is darker is fluid within the kidney, and as good as parenchyma.
+# Most that is so near to the centre is parenchyma. What is darker is fluid within the kidney, and as good as
+# parenchyma.
 NEAR_MM = 30.0
-# Thickness of each of the layers within and beyond the outline that are compared: two of the squares that speckle is averaged over.
+# Thickness of each of the layers within and beyond the outline that are compared: two of the squares that
+# speckle is averaged over.
 LAYER_MM = 6
-# At a border grey values rise by this ratio: a step costs 1/e there, 1 where they do not rise. Where the image does not reach, it is not known
-# whether there is a border.
+# At a border grey values rise by this ratio: a step costs 1/e there, 1 where they do not rise. Where the
+# image does not reach, it is not known whether there is a border.
 CONTRAST, UNKNOWN_COST = 1.15, 0.5
-# Neighbouring directions, 2 degrees apart, are averaged with this SD, in directions: 2 mm of outline at 30 mm.
+# Neighbouring directions, 2 degrees apart, are averaged with this SD, in directions: 2 mm of outline at 30
+# mm.
 ANGLES, ANGLES_SD = 180, 2.0
 # The sinus is in the outline of a kidney: hollows that no disc of this radius enters.
 SINUS_MM = 10.0
@@ -56,7 +61,9 @@ def outlined_kidney(
 
 
 def outline_by_place(covered: np.ndarray, centre: Sequence[float], pixel_mm: Sequence[float]) -> np.ndarray:
-    """Return an outline (rows, columns) that sees no image: an ellipse about the kidney's centre that touches the array."""
+    """Return an outline (rows, columns) that sees no image: an ellipse about the kidney's centre that
+    touches the array.
+    """
     row, column = np.indices(covered.shape)
     height = (centre[0] + 0.5) * pixel_mm[0]
     down, right = (row - centre[0]) * pixel_mm[0], (column - centre[1]) * pixel_mm[1] / ELLIPSE_WIDTH
@@ -68,7 +75,9 @@ def _angles() -> np.ndarray:
 
 
 def _step_cost(level: np.ndarray, reached: np.ndarray) -> np.ndarray:
-    """Return the cost of a step of the outline by direction and radius [mm], of the logarithm of grey values and of where they are known."""
+    """Return the cost of a step of the outline by direction and radius [mm], of the logarithm of grey
+    values and of where they are known.
+    """
 
     def layers(values: np.ndarray) -> np.ndarray:
         smooth = ndimage.gaussian_filter1d(values, ANGLES_SD, axis=0, mode="wrap")
@@ -85,7 +94,9 @@ def _step_cost(level: np.ndarray, reached: np.ndarray) -> np.ndarray:
 
 
 def _closed_path(cost: np.ndarray) -> np.ndarray:
-    """Return the radius (angles,), as an index, of a cheap path through a cost (angles, radii) that begins and ends at the cheapest step."""
+    """Return the radius (angles,), as an index, of a cheap path through a cost (angles, radii) that begins
+    and ends at the cheapest step.
+    """
     first, start = np.unravel_index(cost.argmin(), cost.shape)
     turn = np.roll(cost, -first, axis=0)
     path, _ = route_through_array(np.concatenate([turn, turn[:1]]), (0, start), (len(cost), start))
@@ -95,7 +106,9 @@ def _closed_path(cost: np.ndarray) -> np.ndarray:
 
 
 def kidney_contour(kidney: np.ndarray, pixel_mm: Sequence[float]) -> np.ndarray:
-    """Return a mask of parenchyma (rows, columns) with the sinus, which labels of parenchyma may leave out: hollows of SINUS_MM and holes."""
+    """Return a mask of parenchyma (rows, columns) with the sinus, which labels of parenchyma may leave
+    out: hollows of SINUS_MM and holes.
+    """
     return ndimage.binary_fill_holes(closed(kidney, SINUS_MM, pixel_mm))
 
 
@@ -115,7 +128,9 @@ def closed(mask: np.ndarray, radius_mm: float, pixel_mm: Sequence[float]) -> np.
 
 
 def _distance(mask: np.ndarray, pixel_mm: Sequence[float]) -> np.ndarray:
-    """Return the distance [mm] of each pixel of a mask from the nearest outside it, infinite where there is none."""
+    """Return the distance [mm] of each pixel of a mask from the nearest outside it, infinite where there
+    is none.
+    """
     if mask.all():
         return np.full(mask.shape, np.inf)
     return ndimage.distance_transform_edt(mask, sampling=pixel_mm)

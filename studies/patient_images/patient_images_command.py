@@ -1,4 +1,6 @@
-"""The command ``study patient-images``: B-mode images of patients' kidneys beside their CT, and what can be seen in them."""
+"""The command ``study patient-images``: B-mode images of patients' kidneys beside their CT, and what can
+be seen in them.
+"""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -48,8 +50,8 @@ NOISE_COLUMNS = (
 
 @dataclass(frozen=True)
 class PatientImageRow:
-    """Figures of one patient and probe, pooled over the standard planes (``picture_figures``, ``scanline_figures``); None where there is
-    too little to judge.
+    """Figures of one patient and probe, pooled over the standard planes (``picture_figures``,
+    ``scanline_figures``); None where there is too little to judge.
     """
 
     patient: int
@@ -84,8 +86,9 @@ class PatientImageRow:
 def patient_images(patients: tuple[Path, ...], names: tuple[str, ...], out: Path) -> None:
     """Show B-mode images of kidneys beside their CT, and measure what can be seen.
 
-    PATIENT... are patients' folders or scene files with a CT and labels. One sheet for each patient and probe: CT, labels, classes and B-mode
-    image of eight standard planes. Half a minute for each patient and probe.
+    PATIENT... are patients' folders or scene files with a CT and labels. One sheet for each patient and
+    probe: CT, labels, classes and B-mode image of eight standard planes. Half a minute for each patient and
+    probe.
     """
     make_folder(out)
     probes = {Path(name).stem: load_probe(name) for name in names}
@@ -104,7 +107,8 @@ def patient_images(patients: tuple[Path, ...], names: tuple[str, ...], out: Path
     shares = np.array([(row.outlined, row.outlined_by_place) for row in rows], float)
     outlined, by_place = shares.mean(axis=0).tolist()
     text = (
-        f"{table_of(COLUMNS, described)}\n\nOutlined on {100 * outlined:.0f} % of the planes, by place alone on {100 * by_place:.0f} %\n\n"
+        f"{table_of(COLUMNS, described)}\n\nOutlined on {100 * outlined:.0f} % of the planes, by place "
+        f"alone on {100 * by_place:.0f} %\n\n"
         f"{table_of(NOISE_COLUMNS, noise)}"
     )
     report = dict(

@@ -1,4 +1,6 @@
-"""What a patient's CT, labels and surface show at places [mm]: the truth that B-mode images of the patient are compared with."""
+"""What a patient's CT, labels and surface show at places [mm]: the truth that B-mode images of the patient
+are compared with.
+"""
 
 from dataclasses import dataclass
 
@@ -16,7 +18,8 @@ LESIONS = ("tumour", "cyst", "stone")
 PARENCHYMA = ("kidney", "cortex", "medulla")
 # Behind what has fewer or more HU, nothing is to be seen.
 GAS_HU, BONE_HU = -300.0, 300.0
-# A kidney whose median is above the first has taken up contrast agent; what is above the median by the second is the agent itself.
+# A kidney whose median is above the first has taken up contrast agent; what is above the median by the second
+# is the agent itself.
 ENHANCED_HU, AGENT_ABOVE_HU = 80.0, 130.0
 SURFACE_MM, SURFACE_REACH_MM = 1.0, 8.0
 # A shadow is wider by so many scanlines to each side.
@@ -43,8 +46,10 @@ class Volume:
 class PatientTruth:
     """A patient at rest.
 
-    ``hu``; signed distances [mm], negative inside, from the labelled kidney with sinus and lesions as far as these are labelled, from its
-    parenchyma, from contrast agent in its collecting system, and from the organ's surface. ``median_hu`` is that of the parenchyma, ``voxel_mm`` the longest edge of the CT's voxels.
+    ``hu``; signed distances [mm], negative inside, from the labelled kidney with sinus and lesions as far as
+    these are labelled, from its parenchyma, from contrast agent in its collecting system, and from the
+    organ's surface. ``median_hu`` is that of the parenchyma, ``voxel_mm`` the longest edge of the CT's
+    voxels.
     """
 
     hu: Volume
@@ -77,8 +82,9 @@ class PatientTruth:
         )
 
     def hidden_from_mm(self, probe: Probe, world_from_plane: np.ndarray) -> np.ndarray:
-        """Return the depths (scanlines,) from which on gas, bone, a stone or the CT's border hides what a probe at a pose (4, 4) shows;
-        infinite where nothing does. Contrast agent hides nothing. What hides one scanline hides SHADOW_SCANLINES beside it.
+        """Return the depths (scanlines,) from which on gas, bone, a stone or the CT's border hides what a
+        probe at a pose (4, 4) shows; infinite where nothing does. Contrast agent hides nothing. What hides
+        one scanline hides SHADOW_SCANLINES beside it.
         """
         depth = sample_depths(probe)
         places = on_scanlines(probe, world_from_plane, depth)
@@ -97,7 +103,8 @@ def _labelled(anatomy: ScannedAnatomy, *tissues: str) -> np.ndarray:
 
 
 def contrast_agent(hu: np.ndarray, kidney: np.ndarray, median_hu: float) -> np.ndarray:
-    """Return the mask of contrast agent in the collecting system of a kidney: dense pieces that begin inside its mask.
+    """Return the mask of contrast agent in the collecting system of a kidney: dense pieces that begin inside
+    its mask.
 
     None in a kidney that is not enhanced, where dense pieces are stones.
     """
@@ -108,8 +115,9 @@ def contrast_agent(hu: np.ndarray, kidney: np.ndarray, median_hu: float) -> np.n
 
 
 def signed_distance_of(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return distances [mm] from a mask, negative inside, whose zero is halfway between voxels (Raya & Udupa 1990, IEEE Trans Med Imaging
-    9, 32: between thick slices its contour has no stairs); FAR_MM where it is empty.
+    """Return distances [mm] from a mask, negative inside, whose zero is halfway between voxels (Raya & Udupa
+    1990, IEEE Trans Med Imaging 9, 32: between thick slices its contour has no stairs); FAR_MM where it is
+    empty.
     """
     if not mask.any():
         return np.full(mask.shape, FAR_MM, np.float32)

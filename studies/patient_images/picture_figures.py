@@ -1,4 +1,6 @@
-"""Figures of B-mode images against the truth of their pixels: whether the kidney's border can be seen, grey levels, outlines."""
+"""Figures of B-mode images against the truth of their pixels: whether the kidney's border can be seen,
+grey levels, outlines.
+"""
 
 from collections.abc import Sequence
 
@@ -21,9 +23,10 @@ LEAST_PIXELS = 200
 def picture_figures(scans: Sequence[PlaneScan]) -> dict[str, float]:
     """Return figures pooled over the planes of a patient and a probe.
 
-    ``fat_auc`` and ``surroundings_auc``: areas under the ROC curve of "brighter than kidney" (``PictureTruth``) of the averaged picture.
-    ``grey_median`` and ``grey_p90`` of all that the scanlines reach. ``outlined``: the share of planes that show kidney and whose outline has
-    a Dice of GOOD_DICE or more; ``outlined_by_place``: the same of an outline that sees no picture.
+    ``fat_auc`` and ``surroundings_auc``: areas under the ROC curve of "brighter than kidney"
+    (``PictureTruth``) of the averaged picture. ``grey_median`` and ``grey_p90`` of all that the scanlines
+    reach. ``outlined``: the share of planes that show kidney and whose outline has a Dice of GOOD_DICE or
+    more; ``outlined_by_place``: the same of an outline that sees no picture.
     """
     kidney = _pooled([scan.averaged[scan.truth.judged_kidney] for scan in scans])
     fat = _pooled([scan.averaged[scan.truth.fat] for scan in scans])
@@ -42,7 +45,9 @@ def picture_figures(scans: Sequence[PlaneScan]) -> dict[str, float]:
 
 
 def outline_dice(scan: PlaneScan) -> tuple[float, float]:
-    """Return Dice of the segmenter's outline of the kidney, and of one that sees no picture, in what is seen."""
+    """Return Dice of the segmenter's outline of the kidney, and of one that sees no picture, in what is
+    seen.
+    """
     seen = scan.truth.seen
     contour = kidney_contour(scan.truth.kidney & scan.covered, scan.pixel_mm) & scan.covered
     centre = np.argwhere(contour & seen).mean(axis=0)
@@ -52,7 +57,9 @@ def outline_dice(scan: PlaneScan) -> tuple[float, float]:
 
 
 def roc_area(brighter: np.ndarray, darker: np.ndarray) -> float:
-    """Return the area under the ROC curve of "brighter" (n,) above "darker" (m,), ties one half; NaN of fewer than LEAST_PIXELS."""
+    """Return the area under the ROC curve of "brighter" (n,) above "darker" (m,), ties one half; NaN of
+    fewer than LEAST_PIXELS.
+    """
     if min(len(brighter), len(darker)) < LEAST_PIXELS:
         return float("nan")
     return float(mannwhitneyu(brighter, darker).statistic / (len(brighter) * len(darker)))

@@ -18,9 +18,10 @@ DEPTHS_MM = 4.0, 45.0
 class PictureTruth:
     """Masks (rows, columns) of an image's pixels.
 
-    ``kidney``: labelled as kidney, its sinus or lesion, at whatever depth, seen or not. ``seen``: reached by the scanlines, not behind gas, bone
-    or stones. The others are what of the seen at DEPTHS_MM, without contrast agent, is parenchyma (``judged_kidney``), not kidney but within
-    NEAR_MM of it (``surroundings``), and of these has FAT_HU (``fat``).
+    ``kidney``: labelled as kidney, its sinus or lesion, at whatever depth, seen or not. ``seen``: reached by
+    the scanlines, not behind gas, bone or stones. The others are what of the seen at DEPTHS_MM, without
+    contrast agent, is parenchyma (``judged_kidney``), not kidney but within NEAR_MM of it (``surroundings``),
+    and of these has FAT_HU (``fat``).
     """
 
     kidney: np.ndarray

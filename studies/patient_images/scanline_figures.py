@@ -1,4 +1,6 @@
-"""Figures of the echoes of a patient's kidney, from scanlines before the grey map: its capsule, and contrast agent in its collecting system."""
+"""Figures of the echoes of a patient's kidney, from scanlines before the grey map: its capsule, and
+contrast agent in its collecting system.
+"""
 
 from collections.abc import Callable, Sequence
 
@@ -10,14 +12,16 @@ from studies.patient_images.scanline_truth import ScanlineTruth
 
 # Incidence [degrees] of the beam on the capsule.
 SQUARE_DEG, ASLANT_DEG = (0.0, 10.0), (15.0, 20.0)
-# The capsule's echo is looked for so near to the organ's surface, and compared with the kidney from the first to the second distance inside.
+# The capsule's echo is looked for so near to the organ's surface, and compared with the kidney from the first
+# to the second distance inside.
 CAPSULE_MM = 1.0
 INSIDE_MM = 2.0, 6.0
 CONTROL_MM = 4.0
 LEAST_CROSSINGS = 40
 # Parenchyma is deeper inside the label than the first, and of HU within the second of the kidney's median.
 UNDER_MM, PARENCHYMA_HU = 2.0, 60.0
-# Contrast agent is judged so far inside its border; enhancement from the first to the second distance behind it.
+# Contrast agent is judged so far inside its border; enhancement from the first to the second distance behind
+# it.
 CORE_MM, BEHIND_MM = 1.0, (2.0, 8.0)
 # Levels are compared in bins of depth.
 BIN_MM, LEAST_SAMPLES = 2.0, 30
@@ -29,11 +33,13 @@ def decibel(power: float) -> float:
 
 
 def capsule_figures(truths: Sequence[ScanlineTruth]) -> dict[str, float]:
-    """Return how much the capsule's echo is above the kidney beneath it [dB], where the beam meets it within SQUARE_DEG and ASLANT_DEG.
+    """Return how much the capsule's echo is above the kidney beneath it [dB], where the beam meets it within
+    SQUARE_DEG and ASLANT_DEG.
 
-    On each scanline that crosses the organ's surface into labelled kidney deeper than DEPTHS_MM[0]: the greatest power within CAPSULE_MM of the
-    surface, and the mean power INSIDE_MM beneath it; the ratio is that of the means over all crossings. ``capsule_control_db`` is what
-    the greatest of speckle alone makes: the same of a surface CONTROL_MM beneath the real one.
+    On each scanline that crosses the organ's surface into labelled kidney deeper than DEPTHS_MM[0]: the
+    greatest power within CAPSULE_MM of the surface, and the mean power INSIDE_MM beneath it; the ratio is
+    that of the means over all crossings. ``capsule_control_db`` is what the greatest of speckle alone makes:
+    the same of a surface CONTROL_MM beneath the real one.
     """
     crossings = np.concatenate([_crossings(truth) for truth in truths])
     figures = {}
@@ -49,7 +55,9 @@ def capsule_figures(truths: Sequence[ScanlineTruth]) -> dict[str, float]:
 
 
 def _crossings(truth: ScanlineTruth) -> np.ndarray:
-    """Return of each crossing of the surface (n, 4) the incidence [degrees], and the powers: greatest, greatest of the control, mean inside."""
+    """Return of each crossing of the surface (n, 4) the incidence [degrees], and the powers: greatest,
+    greatest of the control, mean inside.
+    """
     rows = []
     inside = truth.surface_mm < 0
     for line, sample in np.argwhere(inside[:, 1:] != inside[:, :-1]):
@@ -77,10 +85,12 @@ def _first(where: np.ndarray) -> int:
 
 
 def agent_figures(truths: Sequence[ScanlineTruth], patient: PatientTruth) -> dict[str, float]:
-    """Return levels [dB] of contrast agent in the collecting system, and of the parenchyma BEHIND_MM behind it, both against parenchyma
-    at like depth that has none before it; NaN where there is none, as in a kidney that is not enhanced.
+    """Return levels [dB] of contrast agent in the collecting system, and of the parenchyma BEHIND_MM behind
+    it, both against parenchyma at like depth that has none before it; NaN where there is none, as in a kidney
+    that is not enhanced.
 
-    ``agent_db`` is below 0 where the agent is fluid; ``behind_agent_db`` is below 0 in a shadow, above 0 where fluid enhances.
+    ``agent_db`` is below 0 where the agent is fluid; ``behind_agent_db`` is below 0 in a shadow, above 0
+    where fluid enhances.
     """
     pairs = [(truth, _behind_agent_mm(truth)) for truth in truths]
 
@@ -111,7 +121,9 @@ def _is_judged(truth: ScanlineTruth) -> np.ndarray:
 
 
 def _behind_agent_mm(truth: ScanlineTruth) -> np.ndarray:
-    """Return how far behind the last contrast agent before it a sample is [mm] (scanlines, samples); infinite without."""
+    """Return how far behind the last contrast agent before it a sample is [mm] (scanlines, samples);
+    infinite without.
+    """
     last = np.where(truth.agent_mm < 0, truth.depth_mm, -np.inf)
     return truth.depth_mm - np.maximum.accumulate(last, axis=1)
 
@@ -119,8 +131,8 @@ def _behind_agent_mm(truth: ScanlineTruth) -> np.ndarray:
 def level_at_like_depth(
     power: np.ndarray, depth_mm: np.ndarray, other_power: np.ndarray, other_depth_mm: np.ndarray
 ) -> float:
-    """Return the mean power (n,) of samples over that of others (m,) in the same bins of depth [dB], weighted as the first are; NaN where no
-    bin has LEAST_SAMPLES of both.
+    """Return the mean power (n,) of samples over that of others (m,) in the same bins of depth [dB], weighted
+    as the first are; NaN where no bin has LEAST_SAMPLES of both.
     """
     bins = [(depth // BIN_MM).astype(int) for depth in (depth_mm, other_depth_mm)]
     length = max((int(each.max()) + 1 for each in bins if len(each)), default=1)

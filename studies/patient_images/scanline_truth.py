@@ -14,9 +14,10 @@ from ultrasound.probe import Probe
 class ScanlineTruth:
     """Arrays (scanlines, samples) of one image, before the grey map, with gain and TGC.
 
-    ``power`` is the mean square of the echo, linear. ``surface_mm`` is the signed distance of the sample's tissue from the organ's surface,
-    negative inside, ``incidence_deg`` the angle between scanline and normal of that surface. ``parenchyma_mm`` and ``agent_mm`` as
-    ``PatientTruth``; ``seen`` is not behind gas, bone or stones. ``depth_mm`` (samples,).
+    ``power`` is the mean square of the echo, linear. ``surface_mm`` is the signed distance of the sample's
+    tissue from the organ's surface, negative inside, ``incidence_deg`` the angle between scanline and normal
+    of that surface. ``parenchyma_mm`` and ``agent_mm`` as ``PatientTruth``; ``seen`` is not behind gas, bone
+    or stones. ``depth_mm`` (samples,).
     """
 
     power: np.ndarray
@@ -48,7 +49,9 @@ def scanline_truth(
 
 
 def rest_of_samples(bmode: BMode, probe: Probe) -> np.ndarray:
-    """Return where the tissue of each sample is at rest (scanlines, samples, 3) [mm]: the speed of sound displaces what is shown."""
+    """Return where the tissue of each sample is at rest (scanlines, samples, 3) [mm]: the speed of sound
+    displaces what is shown.
+    """
     at = (np.arange(bmode.samples) + 0.5) / bmode.sound.stride_of(probe)
     first = at.astype(int)
     rest, share = array_of(bmode.sound.rest), (at - first)[:, None]
@@ -56,7 +59,9 @@ def rest_of_samples(bmode: BMode, probe: Probe) -> np.ndarray:
 
 
 def incidence_deg(patient: PatientTruth, place: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Return angles (scanlines, samples) between scanlines of directions (scanlines, 3) and the normal of the organ's surface at places."""
+    """Return angles (scanlines, samples) between scanlines of directions (scanlines, 3) and the normal of
+    the organ's surface at places.
+    """
     half = np.eye(3)
     normal = np.stack(
         [patient.surface_mm.at(place + step) - patient.surface_mm.at(place - step) for step in half], axis=-1

@@ -13,10 +13,12 @@ DEEPEST_MM, STEP_MM = 300.0, 0.5
 
 
 def snr_db(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
-    """Return the mean square of the speckle of cortex over that of the noise [dB] at depths (n,), in uniform cortex from the array on.
+    """Return the mean square of the speckle of cortex over that of the noise [dB] at depths (n,), in uniform
+    cortex from the array on.
 
-    The level of its speckle, less what a pulse loses on the round trip (``AttenuatedPulse.speckle_db``), less ``Probe.noise_before_gain_db``; no loss
-    at interfaces, no elements without contact. Beam and gain change signal and noise alike, or not at all.
+    The level of its speckle, less what a pulse loses on the round trip (``AttenuatedPulse.speckle_db``), less
+    ``Probe.noise_before_gain_db``; no loss at interfaces, no elements without contact. Beam and gain change
+    signal and noise alike, or not at all.
     """
     _, attenuation, level_db, _ = acoustic_table("cortex")
     path = 2 * attenuation * np.asarray(depth_mm, float) / 10 / DB_OF_NEPER
@@ -26,7 +28,9 @@ def snr_db(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
 
 
 def depth_of_noise_mm(probe: Probe) -> float:
-    """Return the depth at which speckle of cortex has the level of the noise [mm]; NaN where that is deeper than DEEPEST_MM."""
+    """Return the depth at which speckle of cortex has the level of the noise [mm]; NaN where that is
+    deeper than DEEPEST_MM.
+    """
     depth = np.arange(0.0, DEEPEST_MM, STEP_MM)
     snr = snr_db(probe, depth)
     below = np.flatnonzero(snr <= 0)

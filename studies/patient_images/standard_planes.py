@@ -1,4 +1,6 @@
-"""Standard planes of a renal scan: long and short axis from the front, the side and the back, the hilum and a pole."""
+"""Standard planes of a renal scan: long and short axis from the front, the side and the back, the hilum
+and a pole.
+"""
 
 from collections.abc import Sequence
 
@@ -17,10 +19,12 @@ BAND_MM = 4.0
 def standard_planes(
     organ: trimesh.Trimesh, hilum_mm: Sequence[float] | None, probe: Probe
 ) -> dict[str, np.ndarray]:
-    """Return the poses (4, 4) by name, PLUS's axes of a probe to patient (LPS, mm); the face touches the organ at rest.
+    """Return the poses (4, 4) by name, PLUS's axes of a probe to patient (LPS, mm); the face touches the
+    organ at rest.
 
-    Front and back are those of the kidney itself, across its polar axis and its hilum; the side is opposite the hilum. Where no hilum is
-    known, which of the two sides it is is not known either, and the plane of the hilum passes through the centre.
+    Front and back are those of the kidney itself, across its polar axis and its hilum; the side is opposite
+    the hilum. Where no hilum is known, which of the two sides it is is not known either, and the plane of the
+    hilum passes through the centre.
     """
     axes = kidney_axes(organ, [], {}, hilum_mm)
     polar, hilar, front = _directions(axes)
@@ -51,7 +55,9 @@ def _directions(axes: KidneyAxes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _touching(
     organ: trimesh.Trimesh, probe: Probe, beam: np.ndarray, lateral: np.ndarray, through: np.ndarray
 ) -> np.ndarray:
-    """Return the pose (4, 4) whose face touches the organ, and whose central scanline passes through a point (3,)."""
+    """Return the pose (4, 4) whose face touches the organ, and whose central scanline passes through a
+    point (3,).
+    """
     pose = np.eye(4)
     pose[:3, :3] = np.column_stack([lateral, beam, np.cross(lateral, beam)])
     surface = (np.concatenate([organ.vertices, organ.triangles_center]) - through) @ pose[:3, :3]

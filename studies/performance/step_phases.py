@@ -12,7 +12,8 @@ from sim.kernels import kernel
 from sim.shape_matching import ShapeMatching
 from sim.solver import Solver, StepSettings, relaxation_at
 
-# Before the iterations of a substep, in an iteration (of shape matching or not), after them; "frames" is once a step.
+# Before the iterations of a substep, in an iteration (of shape matching or not), after them; "frames" is once
+# a step.
 BEFORE = ("tool", "predict", "begin", "find contacts", "leave contacts", "gather")
 IN_ITERATION = {
     True: ("fit clusters", "average goals", "move to goals", "contacts"),
@@ -31,7 +32,8 @@ class Phases:
     def __init__(self, solver: Solver, settings: StepSettings) -> None:
         if solver.has_self_contacts:
             raise UserError(
-                "the pieces of a step are not measured with contacts of particles: leave out contact.particles"
+                "the pieces of a step are not measured with contacts of particles: leave out "
+                "contact.particles"
             )
         self.settings = settings
         self.dt = settings.time_step_s / settings.substeps

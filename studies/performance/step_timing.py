@@ -1,4 +1,5 @@
-"""The command ``study timing``: the paper's Figures 7 and 8 and its Table 5 on this machine, and lower bounds of the time.
+"""The command ``study timing``: the paper's Figures 7 and 8 and its Table 5 on this machine, and lower bounds
+of the time.
 
 Timed are a scene's press at several sizes, and blocks of more and more particles.
 """
@@ -177,7 +178,9 @@ def describe(setup: Setup, solver: Solver, arch: str) -> dict[str, Any]:
 
 
 def blocks(counts: list[int], arch: str, steps: int) -> Iterator[dict[str, Any]]:
-    """Blocks of about ``counts`` particles or nodes at rest on a plane, smallest first, while memory suffices."""
+    """Blocks of about ``counts`` particles or nodes at rest on a plane, smallest first, while memory
+    suffices.
+    """
     for make in (_block_of_cells, _block_of_particles):
         each_mb = 0.0
         for count in counts:
@@ -249,18 +252,22 @@ def against(figures: dict) -> list[str]:
     if not figures:
         return []
     lines = [
-        f"\nIn turn, {PAPERS.size_mm:g} mm, medians: a step with all contacts {figures['step_ms']:.2f} ms, without any "
+        f"\nIn turn, {PAPERS.size_mm:g} mm, medians: a step with all contacts {figures['step_ms']:.2f} "
+        "ms, without any "
         f"{figures['without_contacts_ms']:.2f} ms"
     ]
     if figures["bound_ms"]:
         lines.append(
             f"  fits and averages alone in plain C: {figures['bound_1_core_ms']:.2f} ms on one core, "
-            f"{figures['bound_2_cores_ms']:.2f} ms on two; the step with contacts is {figures['ratio_to_bound']:.2f} times that"
+            f"{figures['bound_2_cores_ms']:.2f} ms on two; the step with contacts is "
+            f"{figures['ratio_to_bound']:.2f} times that"
         )
     if figures["times_pypbd"]:
         lines.append(
-            f"  pypbd's shape matching: {figures['pypbd_1_core_ms']:.2f} ms; {figures['pypbd_million_a_second']:.0f} million "
-            f"membership-iterations a second against {figures['million_a_second']:.0f}: {figures['times_pypbd']:.1f} times"
+            f"  pypbd's shape matching: {figures['pypbd_1_core_ms']:.2f} ms; "
+            f"{figures['pypbd_million_a_second']:.0f} million "
+            f"membership-iterations a second against {figures['million_a_second']:.0f}: "
+            f"{figures['times_pypbd']:.1f} times"
         )
     return lines
 

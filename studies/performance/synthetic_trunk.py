@@ -1,4 +1,6 @@
-"""A synthetic CT of a trunk, as large as hospitals send, with the embedded patient's abdomen in it: DICOM slices and labels."""
+"""A synthetic CT of a trunk, as large as hospitals send, with the embedded patient's abdomen in it: DICOM
+slices and labels.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ SEED = 20160101
 
 
 def write_whole_body(folder: Path, slices: int) -> Path:
-    """Write folder/ct, a DICOM series of 512 x 512 pixels, and folder/labels.nii.gz on the same grid; return the folder."""
+    """Write folder/ct, a DICOM series of 512 x 512 pixels, and folder/labels.nii.gz on the same grid;
+    return the folder.
+    """
     ct, labels = make_phantom()
     centre = np.array(ct.TransformContinuousIndexToPhysicalPoint([n / 2 for n in ct.GetSize()]))
     span = (PIXELS - 1) * PIXEL_MM

@@ -71,7 +71,8 @@ def trade(cases: tuple[Path, ...], out: Path, quick: bool, arch: str) -> None:
     """Measure the error of beads against the time of a step.
 
     Over model, resolution, substeps, iterations and relaxation.
-    The error is the mean over the embedded patient's bead experiment and those of CASE..., folders as `validate` takes them.
+    The error is the mean over the embedded patient's bead experiment and those of CASE..., folders as
+    `validate` takes them.
     """
     make_folder(out)
     loaded = [load_case(EMBEDDED_CASE), *(load_case(case) for case in cases)]
@@ -163,7 +164,9 @@ def points(tried: list[Setup], runs: list[dict[str, Any]]) -> list[dict[str, Any
 
 
 def _built(case: BeadCase, tried: list[Setup], arch: str) -> Iterator[tuple[int, BeadExperiment, Setup]]:
-    """Each setting and its number, with the experiment for it, built anew on a freshly started device for each model and size."""
+    """Each setting and its number, with the experiment for it, built anew on a freshly started device for
+    each model and size.
+    """
     for _, sharing in groupby(enumerate(tried), key=lambda each: (each[1].model, each[1].size_mm)):
         numbered = list(sharing)
         start(arch)

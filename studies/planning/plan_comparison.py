@@ -1,4 +1,6 @@
-"""The command ``study plan``: planned sweeps against unplanned ones, all on a finer model than the one of the plan."""
+"""The command ``study plan``: planned sweeps against unplanned ones, all on a finer model than the one of
+the plan.
+"""
 
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -28,8 +30,8 @@ from ultrasound.target import Target
 TARGET: Target = "margin"
 MARGIN_MM, SPEED_MM_S = 5.0, 10.0
 SEEDS = range(3)
-# The tumour of a kidney that has none: its radius, the depth of its top under the surface [mm], and its place along the organ, a
-# share of the length from the lower pole.
+# The tumour of a kidney that has none: its radius, the depth of its top under the surface [mm], and its place
+# along the organ, a share of the length from the lower pole.
 TUMOUR_MM, UNDER_MM, ALONG = 10.0, 1.5, 0.35
 PLANNED_ON = PRESETS["neo-hookean"]["balanced"]
 # Another grid and more iterations: a plan that suits only its own model scores badly here.
@@ -86,7 +88,10 @@ def count_of(trials: int) -> int:
 def compare(
     scene: Scene, anatomy: LoadedAnatomy, trials: int, workers: Workers, done: Callable[[int], Any]
 ) -> dict[str, Any]:
-    """Plan for the tumour and its margin, and compute planned, straight and random sweeps. Raises PlanError."""
+    """Plan for the tumour and its margin, and compute planned, straight and random sweeps.
+
+    Raises PlanError.
+    """
     probe = probe_of(scene)
     problem = PlanningProblem(scene_of(scene, PLANNED_ON), anatomy, probe, TARGET, MARGIN_MM, scene.trocar)
     plan = make_plan(TrialWorkers(problem, workers), SPEED_MM_S, trials, done)
@@ -115,7 +120,9 @@ def compare(
 
 
 def with_tumour(anatomy: LoadedAnatomy, gravity: np.ndarray) -> LoadedAnatomy:
-    """The anatomy with a ball just under the highest point of its organ, unless it has a tumour of its own."""
+    """The anatomy with a ball just under the highest point of its organ, unless it has a tumour of its
+    own.
+    """
     if anatomy.tumour is not None:
         return anatomy
     organ, up = anatomy.organ, -np.asarray(gravity) / np.linalg.norm(gravity)

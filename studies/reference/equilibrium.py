@@ -116,8 +116,9 @@ class Equilibrium:
     ) -> tuple[np.ndarray, float, int]:
         """Equilibrium by slow motion, in which each step is tethered to the end of the last one.
 
-        Pseudo-transient continuation (Kelley & Keyes, SIAM J. Numer. Anal. 35, 1998): it converges even where the body
-        jumps. Steps become longer while they converge easily. The anchors of friction are updated after each step.
+        Pseudo-transient continuation (Kelley & Keyes, SIAM J. Numer. Anal. 35, 1998): it converges even where
+        the body jumps. Steps become longer while they converge easily. The anchors of friction are updated
+        after each step.
 
         Args:
             state: initial displacements [mm], shape (nodes, 3).
@@ -171,8 +172,9 @@ class Equilibrium:
     def _searched(self, state: np.ndarray, balance: Balance, step: np.ndarray) -> tuple[np.ndarray, Balance]:
         """A line search for the residual's work, then a shorter step if it also reduces the residual.
 
-        Without friction the residual's work is the slope of the energy. Points that stick at one end of the step and
-        slide at the other make Newton's method alternate between two states; shorter steps prevent that.
+        Without friction the residual's work is the slope of the energy. Points that stick at one end of the
+        step and slide at the other make Newton's method alternate between two states; shorter steps prevent
+        that.
         """
         reach, found = self._line_search(state, balance.work(step), step)
         for shorter in (reach / 2, reach / 4, reach / 8):

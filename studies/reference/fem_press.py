@@ -1,7 +1,7 @@
 """The bead experiment: a kidney that settles in its support under gravity and is pressed by a transducer.
 
-z is up. The solution depends on the loading path, as friction does: the kidney is lowered until it touches, settles in
-slow motion, and then the transducer moves down in increments.
+z is up. The solution depends on the loading path, as friction does: the kidney is lowered until it touches,
+settles in slow motion, and then the transducer moves down in increments.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,8 +18,8 @@ from studies.reference.smooth_obstacles import FAR_MM, DistanceField, RoundedBox
 
 GRAVITY_M_S2, FRICTION = 9.81, 0.35
 STAGE_TOLERANCE, PATH_TOLERANCE = 1e-5, 5e-5
-# First tethers: while the kidney settles, and where tissue jumps around the edge of the probe, so that there is no
-# continuous path of equilibria.
+# First tethers: while the kidney settles, and where tissue jumps around the edge of the probe, so that there
+# is no continuous path of equilibria.
 SETTLING_KPA_MM2, JUMPING_KPA_MM2 = 1e-2, 4.0
 # Increments of the press; the first ones are small, as the contact area then grows fastest.
 FIRST_INCREMENT_MM, MOST_INCREMENT_MM, LEAST_INCREMENT_MM = 0.3, 1.2, 0.15
@@ -84,7 +84,8 @@ class FemExperiment:
         self.equilibrium = Equilibrium(self.solid, [self.support, self.probe], weight)
 
     def stages(self) -> Iterator[FemStage]:
-        """Solve stage by stage, in increments that are shorter or in slow motion where Newton's method does not converge.
+        """Solve stage by stage, in increments that are shorter or in slow motion where Newton's method does
+        not converge.
 
         Raises NotConvergedError.
         """
@@ -135,7 +136,9 @@ class FemExperiment:
         return state, residual
 
     def _first_guess(self, state: np.ndarray) -> np.ndarray:
-        """Contact with a softer transducer, as a whole increment of overlap would be an unrealistic pressure."""
+        """Contact with a softer transducer, as a whole increment of overlap would be an unrealistic
+        pressure.
+        """
         stiff = self.probe.law
         self.probe.law = replace(stiff, stiffness_kpa_mm=SOFT_KPA_MM)
         try:

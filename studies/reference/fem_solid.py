@@ -41,7 +41,9 @@ class MeshError(ValueError):
 
 
 class CurvedMapping(MappingIsoparametric):
-    """scikit-fem's mapping, whose own inverse does not converge for points outside a curved tetrahedron; here they have nan."""
+    """scikit-fem's mapping, whose own inverse does not converge for points outside a curved tetrahedron;
+    here they have nan.
+    """
 
     def invF(self, x: np.ndarray, tind: np.ndarray | None = None, **_unused: object) -> np.ndarray:
         """Reference coordinates of points x [mm], both of shape (3, tets, points)."""
@@ -56,7 +58,8 @@ class CurvedMapping(MappingIsoparametric):
 class FemSolid:
     """A body at rest, free of stress, and the forces of its deformation.
 
-    Sparse matrices take values at the nodes to the points of a quadrature, and their transposes take forces back.
+    Sparse matrices take values at the nodes to the points of a quadrature, and their transposes take forces
+    back.
 
     Attributes:
         rest: nodes [mm], shape (nodes, 3): corners first, then the middles of edges.
@@ -85,7 +88,9 @@ class FemSolid:
             raise MeshError("a curved tetrahedron at the surface is nearly folded over")
 
     def deformation(self, displacement: np.ndarray) -> np.ndarray:
-        """Deformation gradients F at the Gauss points, shape (points, 3, 3), for displacements [mm] (nodes, 3)."""
+        """Deformation gradients F at the Gauss points, shape (points, 3, 3), for displacements [mm]
+        (nodes, 3).
+        """
         return np.eye(3) + (self._gradient @ displacement).reshape(-1, 3, 3).swapaxes(1, 2)
 
     def least_volume_ratio(self, displacement: np.ndarray) -> float:
@@ -125,7 +130,8 @@ class FemSolid:
 
 
 def stiffness_of(operator: csr_array, blocks: np.ndarray) -> csr_array:
-    """Stiffness on the nodes, rows and columns 3 node + axis, of blocks between the values that an operator gives.
+    """Stiffness on the nodes, rows and columns 3 node + axis, of blocks between the values that an operator
+    gives.
 
     ``operator`` (n values, nodes), ``blocks`` (n, 3 values, 3 values) with axes of space last.
     """
@@ -145,7 +151,9 @@ def _values(basis: AbstractBasis) -> np.ndarray:
 
 
 def _operator(basis: AbstractBasis, values: np.ndarray) -> csr_array:
-    """Sparse matrix from the nodes to what the shape functions have as ``values`` (10, elements, ...), in this order."""
+    """Sparse matrix from the nodes to what the shape functions have as ``values`` (10, elements, ...), in
+    this order.
+    """
     rows = np.broadcast_to(np.arange(values[0].size).reshape(values[0].shape), values.shape)
     nodes = basis.element_dofs.reshape(*values.shape[:2], *[1] * (values.ndim - 2))
     places = rows.ravel(), np.broadcast_to(nodes, values.shape).ravel()

@@ -22,14 +22,19 @@ COARSER = 1.4
 
 
 def graded_mesh(kidney: trimesh.Trimesh, press: FemPress, near_mm: float) -> MeshTet2:
-    """Tetrahedra that fill the kidney, with edges of ``near_mm`` where the transducer touches it. Raises MeshError."""
+    """Tetrahedra that fill the kidney, with edges of ``near_mm`` where the transducer touches it.
+
+    Raises MeshError.
+    """
     return tetrahedra(kidney, size_around(kidney, press, near_mm))
 
 
 def size_around(
     kidney: trimesh.Trimesh, press: FemPress, near_mm: float
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """The length (n,) of edges [mm] at points (n, 3): ``near_mm`` where the transducer touches the kidney, and longer away from it."""
+    """The length (n,) of edges [mm] at points (n, 3): ``near_mm`` where the transducer touches the kidney,
+    and longer away from it.
+    """
     box = RoundedBox(np.array(press.size_mm), press.edge_mm)
     beside = np.abs(kidney.vertices[:, :2] - press.over_mm) - np.array(press.size_mm[:2]) / 2
     top = kidney.vertices[(beside <= 0).all(axis=1), 2].max()
@@ -94,7 +99,9 @@ def solved(
 
 
 def in_case_frame(surface: trimesh.Trimesh, gravity: np.ndarray, organ: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A surface in the frame of the files: z against gravity, x along the organ's length, its centre of mass 0."""
+    """A surface in the frame of the files: z against gravity, x along the organ's length, its centre of
+    mass 0.
+    """
     up = -np.asarray(gravity, float) / np.linalg.norm(gravity)
     length = np.linalg.svd(organ.vertices - organ.vertices.mean(axis=0), full_matrices=False)[2][0]
     x = length - (length @ up) * up

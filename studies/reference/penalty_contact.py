@@ -36,14 +36,17 @@ class Law:
         return self.stiffness_kpa_mm * (soft**2 / (2 * self.soft_mm) + depth - soft)
 
     def most_slip(self, pressure: np.ndarray) -> np.ndarray:
-        """Slip [mm] at which the friction has reached Coulomb's limit, shape (n,); beyond it the anchor follows."""
+        """Slip [mm] at which the friction has reached Coulomb's limit, shape (n,); beyond it the anchor
+        follows.
+        """
         return (1 + self.blend) * self.friction * pressure / self.stick_kpa_mm
 
     def friction_share(self, stretch: np.ndarray) -> np.ndarray:
         """Transition from elastic slip to sliding, phi(r) / r, shape (n,).
 
-        ``stretch`` is r, the elastic friction as a share of Coulomb's limit, shape (n,). A parabola joins phi = r and
-        phi = 1: with a corner there Newton's method would alternate between sticking and sliding points.
+        ``stretch`` is r, the elastic friction as a share of Coulomb's limit, shape (n,). A parabola joins phi
+        = r and phi = 1: with a corner there Newton's method would alternate between sticking and sliding
+        points.
         """
         beyond = np.clip(stretch - (1 - self.blend), 0.0, 2 * self.blend)
         carried = np.minimum(stretch, 1 + self.blend) - beyond**2 / (4 * self.blend)
@@ -77,7 +80,9 @@ class PenaltyContact:
         return self.obstacle.gap(self.places(displacement))
 
     def carry(self, displacement: np.ndarray) -> None:
-        """End an increment: the anchor of a sliding point follows it by its slip, that of a free point wholly."""
+        """End an increment: the anchor of a sliding point follows it by its slip, that of a free point
+        wholly.
+        """
         places = self.places(displacement)
         gap = self.obstacle.gap(places)
         touching = np.flatnonzero(gap < 0)

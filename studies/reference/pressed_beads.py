@@ -1,4 +1,6 @@
-"""Beads in an organ that has a crater, at rest in its support and pressed: solved by finite elements, once."""
+"""Beads in an organ that has a crater, at rest in its support and pressed: solved by finite elements,
+once.
+"""
 
 import igl
 import numpy as np
@@ -31,7 +33,8 @@ def pressed_beads(
         indentations_mm: of each stage, the first 0, shape (stages,).
 
     Returns:
-        Beads at each stage [mm], shape (stages, n, 3); the transducer's centre [mm] and its force on the tissue [N], shape (stages, 3).
+        Beads at each stage [mm], shape (stages, n, 3); the transducer's centre [mm] and its force on the
+        tissue [N], shape (stages, 3).
 
     Raises:
         MeshError: no mesh fills the organ.

@@ -1,7 +1,8 @@
 """The reference as a case folder, which `validate` reads.
 
-The format is version 1 of what studies/accuracy/bead_case.py reads: case.toml, kidney.stl, support.stl, beads.csv, and the solution in
-result.npz; lengths mm, forces N, z up, the kidney's centre of mass at the origin.
+The format is version 1 of what studies/accuracy/bead_case.py reads: case.toml, kidney.stl, support.stl,
+beads.csv, and the solution in result.npz; lengths mm, forces N, z up, the kidney's centre of mass at the
+origin.
 """
 
 from dataclasses import dataclass
@@ -113,7 +114,8 @@ class ReferenceCase:
             },
             "stage": [self._stage(index, moved[index] - moved[0]) for index in range(len(self.stages))],
             "stress_free": {
-                "meaning": "kidney.stl and beads x,y,z: no load, before gravity; stage 0: gravity equilibrium "
+                "meaning": "kidney.stl and beads x,y,z: no load, before gravity; stage 0: gravity "
+                "equilibrium "
                 "in the support, probe just touching",
                 "bead_sag_mean_mm": _rounded(sag.mean()),
                 "bead_sag_max_mm": _rounded(sag.max()),
@@ -135,7 +137,8 @@ class ReferenceCase:
             },
             "provenance": {
                 "kind": "analytic",
-                "formula": "scenes/phantom/kidney.py of Nephron, surface and support as its import makes them",
+                "formula": "scenes/phantom/kidney.py of Nephron, surface and support as its import makes "
+                "them",
                 "licence": "no third-party data",
             },
         }

@@ -1,7 +1,8 @@
 """Graded tetrahedra inside a closed surface, made by Mmg from the surface's signed distance.
 
 Dapogny, Dobrzynski & Frey, *Three-dimensional adaptive domain remeshing, implicit domain meshing, and
-applications to free and moving boundary problems* (J. Comput. Phys. 262, 2014). mmgpy is MIT, Mmg itself LGPL.
+applications to free and moving boundary problems* (J. Comput. Phys. 262, 2014). mmgpy is MIT, Mmg itself
+LGPL.
 """
 
 from collections.abc import Callable
@@ -92,7 +93,9 @@ def _curved(straight: MeshTet, surface: trimesh.Trimesh) -> MeshTet2:
 
 
 def unfolded(mesh: MeshTet2) -> MeshTet2:
-    """The mesh with straight edges where tetrahedra would fold over, or nearly: at a sharp edge of the surface."""
+    """The mesh with straight edges where tetrahedra would fold over, or nearly: at a sharp edge of the
+    surface.
+    """
     while len(folded := _folded(mesh)):
         straight = MeshTet2.from_mesh(MeshTet(mesh.doflocs[:, : mesh.t.max() + 1], mesh.t))
         middles = Dofs(mesh, ElementTetP2()).element_dofs[4:, folded]
@@ -105,7 +108,8 @@ def unfolded(mesh: MeshTet2) -> MeshTet2:
 
 
 def _folded(mesh: MeshTet2) -> np.ndarray:
-    """The curved tetrahedra (n,) whose volume ratio to straight ones changes its sign among their nodes, or almost vanishes.
+    """The curved tetrahedra (n,) whose volume ratio to straight ones changes its sign among their nodes, or
+    almost vanishes.
 
     Also those in which Newton's method does not find a point of their face at the boundary.
     """

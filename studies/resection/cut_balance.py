@@ -1,6 +1,8 @@
-"""Balance after a cut: beads in what remains of the embedded patient's kidney, beside finite elements that solve the remnant alone.
+"""Balance after a cut: beads in what remains of the embedded patient's kidney, beside finite elements that
+solve the remnant alone.
 
-Nephron has the lattice of the whole organ, of which ``remove_tissue`` takes the specimen, as ``PressedOrgan.apply_cut`` does.
+Nephron has the lattice of the whole organ, of which ``remove_tissue`` takes the specimen, as
+``PressedOrgan.apply_cut`` does.
 """
 
 from dataclasses import dataclass, replace
@@ -41,7 +43,9 @@ class CutCase:
 
 
 class CutBeadExperiment(BeadExperiment):
-    """A bead experiment on an organ from which tissue is removed: before it settles, or when the whole organ has settled."""
+    """A bead experiment on an organ from which tissue is removed: before it settles, or when the whole
+    organ has settled.
+    """
 
     def __init__(self, cut: CutCase, setup: Setup, settles_first: bool) -> None:
         super().__init__(cut.case, setup)
@@ -71,7 +75,9 @@ class CutBeadExperiment(BeadExperiment):
 
 @dataclass(frozen=True)
 class BalanceRow:
-    """Mean and largest error of the beads [mm] at each stage, and how far they moved since the first one in the mean."""
+    """Mean and largest error of the beads [mm] at each stage, and how far they moved since the first one
+    in the mean.
+    """
 
     organ: str
     setup: Setup
@@ -106,7 +112,8 @@ class BalanceRow:
 
 
 def balance_rows() -> tuple[list[BalanceRow], np.ndarray]:
-    """The errors of the uncut kidney and of the remnant, and the distances (stages, n) [mm] of the remnant's beads from those of the coarser mesh.
+    """The errors of the uncut kidney and of the remnant, and the distances (stages, n) [mm] of the remnant's
+    beads from those of the coarser mesh.
 
     Taichi must be started. Raises MeshError, NotConvergedError.
     """
@@ -131,7 +138,8 @@ def _first_stages(case: BeadCase) -> BeadCase:
 
 
 def cut_case(uncut: BeadCase) -> tuple[CutCase, np.ndarray]:
-    """The case of the remnant, pressed as the uncut one is, and the distances (stages, n) [mm] of its beads from those of the coarser mesh.
+    """The case of the remnant, pressed as the uncut one is, and the distances (stages, n) [mm] of its beads
+    from those of the coarser mesh.
 
     Raises MeshError, NotConvergedError, ResectionError.
     """

@@ -28,7 +28,9 @@ class StudyCut:
 
 
 def planned_cuts(organ: trimesh.Trimesh, tumour: trimesh.Trimesh) -> Iterator[StudyCut]:
-    """All techniques and margins along lines around tumour and margin, then badly placed cuts that leave tumour. Raises ResectionError."""
+    """All techniques and margins along lines around tumour and margin, then badly placed cuts that leave
+    tumour. Raises ResectionError.
+    """
     lines = {margin: line_over(organ, tumour, margin) for margin in MARGINS_MM}
     points = np.asarray(tumour.vertices)
     for technique in TECHNIQUES:
@@ -40,7 +42,10 @@ def planned_cuts(organ: trimesh.Trimesh, tumour: trimesh.Trimesh) -> Iterator[St
 
 
 def line_over(organ: trimesh.Trimesh, tumour: trimesh.Trimesh, margin_mm: float) -> ScoreLine:
-    """The line around a tumour and a margin where the tumour is nearest to the organ's surface. Raises ResectionError."""
+    """The line around a tumour and a margin where the tumour is nearest to the organ's surface.
+
+    Raises ResectionError.
+    """
     middle = np.asarray(tumour.center_mass)
     direction = places_on(organ, middle)[0][0] - middle
     return line_around(organ, tumour, margin_mm, direction / np.linalg.norm(direction))

@@ -35,7 +35,9 @@ class MarginRow:
 
     @property
     def volume_error(self) -> float:
-        """The largest error of the volumes: of specimen and parenchyma as a share of each, of the tumour left as one of the tumour."""
+        """The largest error of the volumes: of specimen and parenchyma as a share of each, of the tumour
+        left as one of the tumour.
+        """
         wholes = dict(
             specimen_ml=self.reference.specimen_ml,
             tumour_left_ml=self.tumour_ml,

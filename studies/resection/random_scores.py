@@ -14,13 +14,16 @@ from ultrasound.crater import FILLINGS
 
 CIRCLE_MARKS = 12
 MOST_MARGIN_MM, DEPTHS_MM = 8.0, (2.0, 40.0)
-# Share of the cuts to a given depth, where a tumour gives one otherwise; standard deviation of displaced marks.
+# Share of the cuts to a given depth, where a tumour gives one otherwise; standard deviation of displaced
+# marks.
 GIVEN_DEPTH, DISPLACED_MM = 0.4, 3.0
 
 
 @dataclass(frozen=True)
 class RandomScore:
-    """A score and a cut: marks (n, 3) [mm] near the organ's surface, and which vertices (v,) of the tumour count as seen."""
+    """A score and a cut: marks (n, 3) [mm] near the organ's surface, and which vertices (v,) of the tumour
+    count as seen.
+    """
 
     kind: str
     marks: np.ndarray
@@ -71,7 +74,9 @@ def _direction(random: np.random.Generator) -> np.ndarray:
 
 
 def _around(patient: ScoredPatient, random: np.random.Generator) -> np.ndarray:
-    """Around tumour and margin, seen along a direction that is out of the organ at the tumour or any other; marks displaced."""
+    """Around tumour and margin, seen along a direction that is out of the organ at the tumour or any
+    other; marks displaced.
+    """
     assert patient.tumour is not None
     middle = np.asarray(patient.tumour.center_mass)
     outward = middle - np.asarray(patient.organ.center_mass)

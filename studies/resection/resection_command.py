@@ -107,7 +107,8 @@ def _balance() -> Part:
         import skfem  # noqa: F401
     except ImportError as error:
         raise CommandError(
-            f"the balance needs {error.name}, which is not installed: pip install -r requirements-dev.txt, or leave --part balance out"
+            f"the balance needs {error.name}, which is not installed: pip install -r requirements-dev.txt, "
+            "or leave --part balance out"
         ) from None
     from studies.reference.equilibrium import NotConvergedError
     from studies.reference.fem_solid import MeshError
@@ -122,10 +123,12 @@ def _balance() -> Part:
     setup = rows[0].setup
     apart = " / ".join(f"{value:.2f}" for value in to_coarser.mean(axis=1))
     text = (
-        f"Balance after the cut: beads, Nephron beside finite elements (elements of {setup.size_mm:g} mm, steps of "
+        f"Balance after the cut: beads, Nephron beside finite elements (elements of {setup.size_mm:g} "
+        "mm, steps of "
         f"1/{1 / setup.solver.time_step_s:.0f} s, {setup.substeps} x {setup.iterations} iterations)\n"
         f"{table_of(BALANCE_COLUMNS, [row.described() for row in rows])}\n"
-        f"{sum(row.is_within for row in rows)} of {len(rows)} within {BALANCE_BAR_MM:g} mm; the finite elements of the cut kidney, "
+        f"{sum(row.is_within for row in rows)} of {len(rows)} within {BALANCE_BAR_MM:g} mm; the finite "
+        "elements of the cut kidney, "
         f"{EDGE_MM:g} mm and {COARSER_MM:g} mm at crater and probe, differ by {apart} mm"
     )
     report = dict(

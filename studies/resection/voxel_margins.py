@@ -1,4 +1,6 @@
-"""The figures of a cut by voxels and SimpleITK's distance maps: an independent computation of ``rehearsal/resection/judgement.py``."""
+"""The figures of a cut by voxels and SimpleITK's distance maps: an independent computation of
+``rehearsal/resection/judgement.py``.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -38,7 +40,8 @@ def figures_by_voxels(
 ) -> CutFigures:
     """Rasterise all surfaces at rest [mm] on one grid, and measure there.
 
-    The resection surface is where a voxel of the specimen has a neighbour that is of the organ and not of the specimen.
+    The resection surface is where a voxel of the specimen has a neighbour that is of the organ and not of the
+    specimen.
     """
     grid = RasterGrid.around([cut.specimen, tumour], VOXEL_MM, AROUND_MM)
     specimen, whole, growth = (grid.inside(each) for each in (cut.specimen, organ, tumour))
@@ -63,10 +66,12 @@ def figures_by_voxels(
 
 
 def signed_distance_map(inside: np.ndarray, voxel_mm: float) -> np.ndarray:
-    """Signed distance [mm] of voxels (nx, ny, nz) from a solid's surface, negative inside (Maurer et al. 2003, in SimpleITK).
+    """Signed distance [mm] of voxels (nx, ny, nz) from a solid's surface, negative inside (Maurer et al.
+    2003, in SimpleITK).
 
-    SimpleITK's is that from the centres of the solid's outermost voxels. From farther than a voxel the nearest of them is close to the
-    surface; nearer than that it is the mean with the distance from the voxels around the solid.
+    SimpleITK's is that from the centres of the solid's outermost voxels. From farther than a voxel the
+    nearest of them is close to the surface; nearer than that it is the mean with the distance from the voxels
+    around the solid.
     """
     of_solid, of_others = (_maurer(each, voxel_mm) for each in (inside, ~inside))
     near = (of_solid - of_others) / 2
@@ -83,10 +88,11 @@ def _maurer(inside: np.ndarray, voxel_mm: float) -> np.ndarray:
 
 
 def _at_border(solid: np.ndarray, beside: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (n,) [mm] at the faces between voxels of a solid and voxels beside it, and the area (n,) [mm^2] of each.
+    """Distances (n,) [mm] at the faces between voxels of a solid and voxels beside it, and the area (n,)
+    [mm^2] of each.
 
-    A face counts by the share of its axis in the surface's normal: of a plane with the normal n, area A has A |n_a| of faces across
-    axis a, so that their sum, weighted by |n_a|, is A.
+    A face counts by the share of its axis in the surface's normal: of a plane with the normal n, area A has A
+    |n_a| of faces across axis a, so that their sum, weighted by |n_a|, is A.
     """
     normal = np.stack(np.gradient(gaussian_filter(solid.astype(np.float32), SMOOTHED_VOXELS)), axis=-1)
     distances, areas = [], []

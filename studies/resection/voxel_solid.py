@@ -1,4 +1,6 @@
-"""Closed surfaces as voxels, without Boolean operations or distances of triangles: by the parity of crossings along z (NumPy)."""
+"""Closed surfaces as voxels, without Boolean operations or distances of triangles: by the parity of
+crossings along z (NumPy).
+"""
 
 from dataclasses import dataclass
 
@@ -8,7 +10,9 @@ import trimesh
 
 @dataclass(frozen=True)
 class RasterGrid:
-    """Voxels of one width [mm]; ``low_mm`` (3,) is the centre of the first, ``count`` (3,) their number along x, y, z."""
+    """Voxels of one width [mm]; ``low_mm`` (3,) is the centre of the first, ``count`` (3,) their number
+    along x, y, z.
+    """
 
     low_mm: np.ndarray
     count: np.ndarray
@@ -19,7 +23,8 @@ class RasterGrid:
         """A grid around surfaces and a margin."""
         low = np.min([each.bounds[0] for each in surfaces], axis=0) - margin_mm
         high = np.max([each.bounds[1] for each in surfaces], axis=0) + margin_mm
-        # Centres at odd places, so that no vertex or edge of a surface with round coordinates is straight above one.
+        # Centres at odd places, so that no vertex or edge of a surface with round coordinates is straight
+        # above one.
         low += voxel_mm * np.array([0.3178, 0.2345, 0.1416])
         return cls(low, np.ceil((high - low) / voxel_mm).astype(int) + 1, voxel_mm)
 
@@ -33,7 +38,9 @@ class RasterGrid:
         return parity.reshape(self.count)
 
     def _crossings(self, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Columns (n,) and heights (n,) [mm] at which lines along z through the centres cross triangles (f, 3, 3) [mm]."""
+        """Columns (n,) and heights (n,) [mm] at which lines along z through the centres cross triangles
+        (f, 3, 3) [mm].
+        """
         first = np.clip(np.ceil(corner[:, :, :2].min(axis=1) / self.voxel_mm), 0, None).astype(int)
         last = np.minimum(np.floor(corner[:, :, :2].max(axis=1) / self.voxel_mm), self.count[:2] - 1).astype(
             int
@@ -50,7 +57,9 @@ class RasterGrid:
 
 
 def _barycentric(triangle: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Shares (n, 3) of the corners of triangles (n, 3, 2) at points (n, 2); negative where a triangle is seen edge on."""
+    """Shares (n, 3) of the corners of triangles (n, 3, 2) at points (n, 2); negative where a triangle is
+    seen edge on.
+    """
     to = triangle - point[:, None]
     after, last = np.roll(to, -1, axis=1), np.roll(to, -2, axis=1)
     opposite = after[..., 0] * last[..., 1] - after[..., 1] * last[..., 0]

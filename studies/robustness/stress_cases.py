@@ -1,4 +1,6 @@
-"""What the stress test of ``study stability`` does: some 290 cases for each tissue model, in words and numbers."""
+"""What the stress test of ``study stability`` does: some 290 cases for each tissue model, in words and
+numbers.
+"""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -16,10 +18,11 @@ RECOVERED_MM = 0.1
 
 @dataclass(frozen=True)
 class Subject:
-    """Which body: the embedded ``kidney``, an ``ellipsoid``, ``one`` particle or cell, one ``cluster`` or ``two`` balls.
+    """Which body: the embedded ``kidney``, an ``ellipsoid``, ``one`` particle or cell, one ``cluster`` or
+    ``two`` balls.
 
-    ``size_mm`` is the particles' radius or the cells' width; masses within it differ by ``mass_ratio``. ``tissue`` is JSON: what of the section
-    ``[tissue]`` differs from the scene's.
+    ``size_mm`` is the particles' radius or the cells' width; masses within it differ by ``mass_ratio``.
+    ``tissue`` is JSON: what of the section ``[tissue]`` differs from the scene's.
     """
 
     kind: str
@@ -33,11 +36,12 @@ KIDNEY = Subject("kidney")
 
 @dataclass(frozen=True)
 class StressCase:
-    """One stress test: the body, the settings of the step, the motion of the transducer and the initial state.
+    """One stress test: the body, the settings of the step, the motion of the transducer and the initial
+    state.
 
-    ``settings`` are names of StepSettings, ``material`` young_kpa and poisson; ``probe`` and ``state`` are a name in
-    ``stress_motion.PROBES`` and ``stress_motion.STATES`` and its numbers; ``gravity`` and ``heaviest`` multiply the
-    scene's gravity and the mass of one node. Cases of one ``kind`` belong together.
+    ``settings`` are names of StepSettings, ``material`` young_kpa and poisson; ``probe`` and ``state`` are a
+    name in ``stress_motion.PROBES`` and ``stress_motion.STATES`` and its numbers; ``gravity`` and
+    ``heaviest`` multiply the scene's gravity and the mass of one node. Cases of one ``kind`` belong together.
     """
 
     kind: str
@@ -73,7 +77,9 @@ def cases_of(model: str) -> list[StressCase]:
 
 
 def quick_cases_of(model: str) -> list[StressCase]:
-    """The last case of each kind on the kidney, which is the hardest, and the first ones of a particle or cell alone."""
+    """The last case of each kind on the kidney, which is the hardest, and the first ones of a particle or
+    cell alone.
+    """
     chosen: list[StressCase] = []
     for kind in dict.fromkeys(case.kind for case in cases_of(model)):
         of_kind = [case for case in cases_of(model) if case.kind == kind]

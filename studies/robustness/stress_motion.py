@@ -87,7 +87,8 @@ def _spun(t: float, body: Any, dt: float, rad_s: float, axis: int) -> np.ndarray
     return _turned(body, body.home[:3, :3] @ Rotation.from_rotvec(rad_s * t * np.eye(3)[axis]).as_matrix())
 
 
-# The pose (4, 4) at a time [s], from a body with the pose of first contact and the thickness below it, and the time step [s].
+# The pose (4, 4) at a time [s], from a body with the pose of first contact and the thickness below it, and
+# the time step [s].
 PROBES: dict[str, Callable[..., np.ndarray]] = {
     "away": lambda t, body, dt: advanced(body.home, -AWAY_MM),
     "press": _pressed,

@@ -37,7 +37,8 @@ from studies.study_options import dask_option, jobs_option, out_option
 from studies.study_results import finish_axes, table_of, write_results
 from ultrasound.probe_manipulator import advanced
 
-# Cases of one body in a task, after which the progress bar advances; the process keeps the body for the next task.
+# Cases of one body in a task, after which the progress bar advances; the process keeps the body for the next
+# task.
 BATCH = 4
 # How a case may end, and its colour; good ends first.
 OUTCOMES = {
@@ -107,7 +108,9 @@ def _run_all(model: str, cases: list[StressCase]) -> list[dict[str, Any]]:
 
 
 class Extremes:
-    """Extreme values over a whole stress test, and the messages of the divergence check where it restored the state."""
+    """Extreme values over a whole stress test, and the messages of the divergence check where it restored
+    the state.
+    """
 
     def __init__(self, specimen: Specimen) -> None:
         self.specimen = specimen
@@ -192,7 +195,9 @@ def _apply(specimen: Specimen, case: StressCase, extremes: Extremes) -> None:
 
 
 def _set_material(specimen: Specimen, heaviest: float, material: Mapping[str, float]) -> None:
-    """Multiply the mass of the middle node and change the material; shape matching has its mass ratio from the start."""
+    """Multiply the mass of the middle node and change the material; shape matching has its mass ratio from
+    the start.
+    """
     if isinstance(specimen.model, NeoHookean):
         mass = specimen.mass.copy()
         mass[len(mass) // 2] *= heaviest
@@ -211,7 +216,8 @@ def _release(specimen: Specimen, extremes: Extremes) -> None:
 
 
 def _free_shape_error(specimen: Specimen) -> float:
-    """Mean distance [mm] from the stress-free shape after a rigid fit, lifted off the support and without gravity.
+    """Mean distance [mm] from the stress-free shape after a rigid fit, lifted off the support and without
+    gravity.
 
     This removes the effect of friction and of another position on the support.
     """
@@ -244,8 +250,14 @@ def _reason(rest_error: float, shape_error: float | None) -> str | None:
     if shape_error is None:
         return None
     if shape_error <= RECOVERED_MM:
-        return f"its shape has recovered, {rest_error:.2g} mm from its rest position (friction or another place on the support)"
-    return f"its shape differs by {shape_error:.2g} mm: entangled below what the divergence check detects, or not yet at rest"
+        return (
+            f"its shape has recovered, {rest_error:.2g} mm from its rest position (friction or another "
+            "place on the support)"
+        )
+    return (
+        f"its shape differs by {shape_error:.2g} mm: entangled below what the divergence check detects, "
+        "or not yet at rest"
+    )
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -275,7 +287,8 @@ def summary(rows: list[dict[str, Any]]) -> str:
         lines.append(
             f"{model}: {len(cases)} cases, {cases.finite.sum()} finite; {recovered} recovered to "
             f"within {RECOVERED_MM:g} mm; the state was restored in {cases.fallback.count()}; "
-            f"{len(cases) - len(changed) - recovered} recovered their shape in another position; {len(changed)} did not"
+            f"{len(cases) - len(changed) - recovered} recovered their shape in another position; "
+            f"{len(changed)} did not"
         )
         lines += [f"  {row['name']}: {row['reason']}" for _, row in changed.iterrows()]
     return "\n".join(lines)

@@ -1,7 +1,9 @@
-"""Grey values of real pictures: their histograms, and the grey map from the recorded amplitude, where that is recorded too.
+"""Grey values of real pictures: their histograms, and the grey map from the recorded amplitude, where that is
+recorded too.
 
-Both recordings with an IQ signal have pictures that PLUS made, not the scanner: grey = scale times the fourth root of the amplitude, then
-scan conversion (vtkPlusRfToBrightnessConvert.cxx), so that they show PLUS's grey map.
+Both recordings with an IQ signal have pictures that PLUS made, not the scanner: grey = scale times the fourth
+root of the amplitude, then scan conversion (vtkPlusRfToBrightnessConvert.cxx), so that they show PLUS's grey
+map.
 """
 
 from dataclasses import dataclass
@@ -16,9 +18,11 @@ from studies.scanner.recorded_speckle import DEPTH_MM, HALF_SECTOR_DEG, RADIUS_M
 from studies.scanner.scanner_row import ScannerRow
 
 PART = "grey values"
-# Of the picture of the curved array (PLUS's configuration): mm per pixel, and the pixel at the middle of the array's face.
+# Of the picture of the curved array (PLUS's configuration): mm per pixel, and the pixel at the middle of the
+# array's face.
 PIXEL_MM, FACE_PIXEL = 0.15, (53, 300)
-# Of the picture of the linear array, by registration: rows and columns of the image; sample of its first row, samples per row.
+# Of the picture of the linear array, by registration: rows and columns of the image; sample of its first row,
+# samples per row.
 LINEAR_ROWS, LINEAR_COLUMNS = slice(15, 285), slice(25, 215)
 LINEAR_FIRST_SAMPLE, LINEAR_SAMPLES_PER_ROW = 23.0, 7.56
 # Grey values at the ends of the range are cut off; a step of the amplitude [dB].
@@ -29,8 +33,8 @@ DYNAMIC_RANGE_DB, PIXELS = 60.0, 768
 
 @dataclass(frozen=True)
 class GreyMap:
-    """Median grey at steps of the amplitude [dB], both (n,); the fits: grey = scale amplitude^exponent, and linear in dB [grey per dB],
-    each with its residual [grey].
+    """Median grey at steps of the amplitude [dB], both (n,); the fits: grey = scale amplitude^exponent, and
+    linear in dB [grey per dB], each with its residual [grey].
     """
 
     amplitude_db: np.ndarray
@@ -67,7 +71,9 @@ def _rms(values: np.ndarray) -> float:
 
 
 def curved_source(picture: np.ndarray, lines: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return scanline and sample, fractional, of each pixel of the curved array's picture, nan outside the sector."""
+    """Return scanline and sample, fractional, of each pixel of the curved array's picture, nan outside the
+    sector.
+    """
     row, column = np.indices(picture.shape)
     depth = RADIUS_MM + (row - FACE_PIXEL[0]) * PIXEL_MM
     # PLUS has the middle half a pixel to the left.
@@ -89,13 +95,16 @@ def linear_source(lines: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def root_at(amplitude: np.ndarray, line: np.ndarray, sample: np.ndarray) -> np.ndarray:
-    """Return amplitudes at fractional scanlines and samples. Interpolated is the fourth root, whose speckle has no deep gaps."""
+    """Return amplitudes at fractional scanlines and samples.
+
+    Interpolated is the fourth root, whose speckle has no deep gaps.
+    """
     return map_coordinates(amplitude**0.25, [line, sample], order=1) ** 4
 
 
 def our_picture(amplitude: np.ndarray, phantom: EchoPhantom) -> np.ndarray:
-    """Return the picture (rows, columns) uint8 that our log compression and scan conversion make of recorded amplitudes (scanlines,
-    samples) of the phantom's probe.
+    """Return the picture (rows, columns) uint8 that our log compression and scan conversion make of recorded
+    amplitudes (scanlines, samples) of the phantom's probe.
     """
     probe = phantom.probe.model_copy(update={"dyn_range_db": DYNAMIC_RANGE_DB, "grey_map": "linear"})
     phantom.amplitude(probe=probe)

@@ -1,7 +1,8 @@
 """Speckle and contrast of a recorded phantom, beside what our B-mode image gives for a like probe.
 
 The recording is of an endorectal curved array, BK 8848. Its geometry is that of PLUS's configuration for it
-(PlusDeviceSet_fCal_BkProFocus_OpenIGTLinkTracker.xml of PlusLibData); frequency, bandwidth and aperture are not stated.
+(PlusDeviceSet_fCal_BkProFocus_OpenIGTLinkTracker.xml of PlusLibData); frequency, bandwidth and aperture are
+not stated.
 """
 
 from typing import NamedTuple
@@ -90,10 +91,15 @@ def _figures(probe: Probe, region: SpeckleRegion, amplitudes: list[np.ndarray]) 
 
 
 def measurements(iq: np.ndarray, phantom: EchoPhantom) -> list[ScannerRow]:
-    """Return the lines of the table, of the recorded IQ signal (scanlines, samples) and our images of a like probe."""
+    """Return the lines of the table, of the recorded IQ signal (scanlines, samples) and our images of a
+    like probe.
+    """
     probe, amplitude, simulated = phantom.probe, np.abs(iq), our_speckle(phantom)
     lines = []
-    not_stated = f"ours: {FREQUENCY_MHZ:g} MHz, {probe.bandwidth_percent:g} %, f/{probe.f_number:g}; the recording's are not stated"
+    not_stated = (
+        f"ours: {FREQUENCY_MHZ:g} MHz, {probe.bandwidth_percent:g} %, f/{probe.f_number:g}; the "
+        "recording's are not stated"
+    )
     for region in SPECKLE:
         recorded, ours = (_figures(probe, region, each) for each in ([amplitude], simulated))
         lines += [

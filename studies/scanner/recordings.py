@@ -1,4 +1,6 @@
-"""Recordings of real scanners, which are no part of this project: where they are in a folder, and reading them."""
+"""Recordings of real scanners, which are no part of this project: where they are in a folder, and reading
+them.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +31,9 @@ class RecordingError(UserError):
 
 @dataclass(frozen=True)
 class ChannelData:
-    """Echoes of plane waves, ``rf`` (samples, elements, firings), as PyMUST's PWI_disk.mat has them; SI units."""
+    """Echoes of plane waves, ``rf`` (samples, elements, firings), as PyMUST's PWI_disk.mat has them; SI
+    units.
+    """
 
     rf: np.ndarray
     sampling_hz: float
@@ -42,7 +46,8 @@ class ChannelData:
 
 
 def read_iq(path: Path) -> np.ndarray:
-    """Return the IQ signal (scanlines, samples) complex128 of a PLUS recording, from the array downwards. Raises RecordingError.
+    """Return the IQ signal (scanlines, samples) complex128 of a PLUS recording, from the array downwards.
+    Raises RecordingError.
 
     PLUS stores I and Q of a sample side by side (RF_IQ_LINE), or a line of I and one of Q (RF_I_LINE_Q_LINE).
     """
@@ -51,7 +56,8 @@ def read_iq(path: Path) -> np.ndarray:
     kind, orientation = (_field(image, f"UltrasoundImage{name}") for name in ("Type", "Orientation"))
     if lines.ndim != 2 or kind not in ("RF_IQ_LINE", "RF_I_LINE_Q_LINE"):
         raise RecordingError(
-            f"{path.name}: UltrasoundImageType = {kind}, {lines.ndim} dimensions: expected one frame, RF_IQ_LINE or RF_I_LINE_Q_LINE"
+            f"{path.name}: UltrasoundImageType = {kind}, {lines.ndim} dimensions: expected one frame, "
+            "RF_IQ_LINE or RF_I_LINE_Q_LINE"
         )
     iq = lines[:, ::2] + 1j * lines[:, 1::2] if kind == "RF_IQ_LINE" else lines[::2] + 1j * lines[1::2]
     # N is from far to near.

@@ -1,7 +1,9 @@
-"""Ring-down of an array in air: level over depth of a recording, and the law of ``ultrasound/reverberation.py: ringing`` fitted to it.
+"""Ring-down of an array in air: level over depth of a recording, and the law of
+``ultrasound/reverberation.py: ringing`` fitted to it.
 
-In air nothing but the array itself is recorded. Depth is counted in wavelengths of the carrier, which needs no rate of sampling: the
-scanner stores as Q the signal of a quarter of the carrier's period later, so that the delay between I and Q is the carrier's.
+In air nothing but the array itself is recorded. Depth is counted in wavelengths of the carrier, which needs
+no rate of sampling: the scanner stores as Q the signal of a quarter of the carrier's period later, so that
+the delay between I and Q is the carrier's.
 """
 
 from dataclasses import dataclass
@@ -15,7 +17,8 @@ from ultrasound.pulse import DB_OF_NEPER
 from ultrasound.reverberation import BANDS, FALL_IN_AIR, LENS, MORE_IN_AIR_DB
 
 PART = "ring-down in air"
-# Samples in which the recording is free of clipping, and ringing is above the noise; and those of noise alone behind them.
+# Samples in which the recording is free of clipping, and ringing is above the noise; and those of noise alone
+# behind them.
 FITTED, NOISE = slice(160, 800), slice(900, 1100)
 # Samples over which the level is averaged: less than half a period of the carrier.
 AVERAGED = 5
@@ -25,8 +28,8 @@ LENSES, PHASES = np.arange(3.0, 9.0, 0.25), np.arange(0.0, 2 * np.pi, 1.2)
 
 @dataclass(frozen=True)
 class RingDown:
-    """Level [dB] over depth [wavelengths], both (samples,); the fitted law: 1 / e length and lens in wavelengths, half of the depth of
-    the bands, level at the face and of the noise [dB].
+    """Level [dB] over depth [wavelengths], both (samples,); the fitted law: 1 / e length and lens in
+    wavelengths, half of the depth of the bands, level at the face and of the noise [dB].
     """
 
     depth: np.ndarray
@@ -45,7 +48,8 @@ class RingDown:
 
 
 def carrier_of(iq: np.ndarray) -> float:
-    """Return the frequency [cycles per sample] of which the delay from I to Q (scanlines, samples) is a quarter of the period.
+    """Return the frequency [cycles per sample] of which the delay from I to Q (scanlines, samples) is a
+    quarter of the period.
 
     The delay is the slope of the phase of their cross-spectrum over frequency.
     """
@@ -61,7 +65,9 @@ def carrier_of(iq: np.ndarray) -> float:
 
 
 def fitted_ring_down(iq: np.ndarray, fitted: slice = FITTED, noise: slice = NOISE) -> RingDown:
-    """Return the law that fits the IQ signal (scanlines, samples) of an array in air best, robustly, in dB."""
+    """Return the law that fits the IQ signal (scanlines, samples) of an array in air best, robustly, in
+    dB.
+    """
     carrier = carrier_of(iq[:, fitted])
     depth = (np.arange(iq.shape[1]) + 0.5) * carrier / 2
     power = np.convolve((np.abs(iq) ** 2).mean(axis=0), np.ones(AVERAGED) / AVERAGED, "same")

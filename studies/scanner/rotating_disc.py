@@ -1,6 +1,8 @@
-"""Doppler of a rotating disc: a scanner's channel data, beamformed by pymust, through the estimator of ``ultrasound/doppler.py``.
+"""Doppler of a rotating disc: a scanner's channel data, beamformed by pymust, through the estimator of
+``ultrasound/doppler.py``.
 
-A rigid rotation moves each point along the beam by the angular velocity times its lateral place, whatever its depth.
+A rigid rotation moves each point along the beam by the angular velocity times its lateral place, whatever its
+depth.
 """
 
 from dataclasses import dataclass
@@ -24,8 +26,8 @@ DEPTHS_MM = (8.0, 43.0)
 
 @dataclass(frozen=True)
 class Rotation:
-    """Axial velocity away from the array, offset + lateral slope x + axial slope z, fitted to points: lateral place x, depth z [m] and
-    velocity [m/s], each (n,).
+    """Axial velocity away from the array, offset + lateral slope x + axial slope z, fitted to points: lateral
+    place x, depth z [m] and velocity [m/s], each (n,).
     """
 
     offset_m_s: float
@@ -43,7 +45,9 @@ class Rotation:
 
 
 def probe_of(data: ChannelData) -> Probe:
-    """Return a probe with the array of the recording, whose velocity scale is the limit of its pulse repetition."""
+    """Return a probe with the array of the recording, whose velocity scale is the limit of its pulse
+    repetition.
+    """
     width_mm = 1e3 * data.pitch_m * data.rf.shape[1]
     return Probe(
         transducer_name="recorded array",
@@ -59,7 +63,10 @@ def probe_of(data: ChannelData) -> Probe:
 
 
 def beamformed(data: ChannelData, x_m: np.ndarray, z_m: np.ndarray) -> np.ndarray:
-    """Return the IQ signal (x, z, firings) by delay and sum, 0 beyond the recorded depths. Raises EchoStudyError without pymust."""
+    """Return the IQ signal (x, z, firings) by delay and sum, 0 beyond the recorded depths.
+
+    Raises EchoStudyError without pymust.
+    """
     must = pymust()
     parameters = must.utils.Param()
     parameters.fs, parameters.fc, parameters.c = data.sampling_hz, data.centre_hz, data.sound_m_s
@@ -77,8 +84,8 @@ def beamformed(data: ChannelData, x_m: np.ndarray, z_m: np.ndarray) -> np.ndarra
 
 
 def our_velocity(phantom: EchoPhantom, iq: np.ndarray) -> np.ndarray:
-    """Return the velocity away from the array [m/s] (scanlines, tissue samples) that our sample volume and phase make of an ensemble of
-    IQ (scanlines, tissue samples, firings) of the phantom's probe.
+    """Return the velocity away from the array [m/s] (scanlines, tissue samples) that our sample volume and
+    phase make of an ensemble of IQ (scanlines, tissue samples, firings) of the phantom's probe.
     """
     phantom.fill()
     phantom.amplitude()

@@ -62,8 +62,8 @@ Panel = Callable[["Axes"], None]
 def scanner(data: Path, out: Path) -> None:
     """Send echoes of real scanners through the B-mode and Doppler chain.
 
-    The recordings of PLUS (PlusLibData) and PyMUST are no part of this project; a part whose files are missing is left out, with a
-    note. One minute.
+    The recordings of PLUS (PlusLibData) and PyMUST are no part of this project; a part whose files are
+    missing is left out, with a note. One minute.
     """
     pymust()
     make_folder(out)

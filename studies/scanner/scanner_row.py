@@ -5,7 +5,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ScannerRow:
-    """A quantity: of the recording, ours beside it where there is one, its unit, and what has to be known of it."""
+    """A quantity: of the recording, ours beside it where there is one, its unit, and what has to be known
+    of it.
+    """
 
     part: str
     quantity: str

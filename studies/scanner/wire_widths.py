@@ -1,6 +1,7 @@
 """Width of the wires of PLUS's N-wire phantom over depth, beside the width of our beam.
 
-The recording states millimetres per pixel and where the image is in the picture; array, frequency, focus and grey map are not stated.
+The recording states millimetres per pixel and where the image is in the picture; array, frequency, focus and
+grey map are not stated.
 """
 
 from dataclasses import dataclass
@@ -34,7 +35,10 @@ class PixelSize:
 
 
 def pixel_size(configuration: Path) -> PixelSize:
-    """Return what a PLUS configuration states: ImageToProbe and the upper edge of its clip rectangle. Raises SweepError, RecordingError."""
+    """Return what a PLUS configuration states: ImageToProbe and the upper edge of its clip rectangle.
+
+    Raises SweepError, RecordingError.
+    """
     matrix = load_constants(configuration)["ImageToProbe"]
     corner = ElementTree.parse(configuration).find("VolumeReconstruction")
     if corner is None or "ClipRectangleOrigin" not in corner.attrib:
@@ -44,8 +48,8 @@ def pixel_size(configuration: Path) -> PixelSize:
 
 
 def wire_widths(images: np.ndarray, size: PixelSize) -> tuple[np.ndarray, np.ndarray]:
-    """Return depth and lateral width at half of its grey value [mm], each (n,), of each wire across the plane: the outer two of each
-    row, as the wires in the middle pass aslant. Images are (n, rows, columns).
+    """Return depth and lateral width at half of its grey value [mm], each (n,), of each wire across the
+    plane: the outer two of each row, as the wires in the middle pass aslant. Images are (n, rows, columns).
     """
     depths, widths = [], []
     for image in images:
@@ -93,7 +97,9 @@ def beam_width_mm(probe: Probe, depth_mm: float, level_db: float) -> float:
 
 
 def measurements(depth_mm: np.ndarray, width_mm: np.ndarray, probe: Probe) -> list[ScannerRow]:
-    """Return the lines of the table: the median width of the wires in steps of depth, and ours at several levels."""
+    """Return the lines of the table: the median width of the wires in steps of depth, and ours at several
+    levels.
+    """
     lines = []
     step = np.floor(depth_mm / DEPTH_STEP_MM).astype(int)
     for number in np.unique(step):

@@ -1,4 +1,6 @@
-"""Samples of the parameters, and what the outcomes say: bands, and which parameter matters most (Sobol's indices by SALib)."""
+"""Samples of the parameters, and what the outcomes say: bands, and which parameter matters most (Sobol's
+indices by SALib).
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,7 +20,9 @@ LEAST_BAND = 0.05
 
 
 def samples_of(unknowns: Sequence[Unknown], base: int) -> list[dict[str, float]]:
-    """Quasi-random values (Saltelli's scheme on Sobol's sequence): ``base`` times the number of parameters and two."""
+    """Quasi-random values (Saltelli's scheme on Sobol's sequence): ``base`` times the number of parameters
+    and two.
+    """
     shares = sobol_sample.sample(_problem(unknowns), base, calc_second_order=False, seed=SEED)
     return [
         {each.name: float(each.value(share)) for each, share in zip(unknowns, row, strict=True)}
@@ -32,7 +36,9 @@ def count_of(unknowns: Sequence[Unknown], base: int) -> int:
 
 
 def bands_of(outcomes: np.ndarray) -> list[dict[str, Any]]:
-    """At each depth the band of each quantity: 5th, 50th and 95th percentile, from outcomes (samples, depths, 9)."""
+    """At each depth the band of each quantity: 5th, 50th and 95th percentile, from outcomes (samples,
+    depths, 9).
+    """
     rows = []
     for depth in range(outcomes.shape[1]):
         values = outcomes[:, depth]
@@ -50,7 +56,9 @@ def _band(values: np.ndarray) -> dict[str, float]:
 
 
 def indices_of(unknowns: Sequence[Unknown], outcomes: np.ndarray) -> dict[str, dict[str, dict[str, float]]]:
-    """Total Sobol indices of each quantity at the greatest depth, by parameter, with their 95 % confidence."""
+    """Total Sobol indices of each quantity at the greatest depth, by parameter, with their 95 %
+    confidence.
+    """
     found = {}
     for n, name in enumerate(QUANTITIES):
         values = outcomes[:, -1, n]

@@ -53,14 +53,16 @@ def _power_of_two(context: click.Context, parameter: click.Parameter, value: int
     default=32,
     show_default=True,
     callback=_power_of_two,
-    help="Base of the quasi-random sample, a power of two; the presses are this times the number of parameters and two.",
+    help="Base of the quasi-random sample, a power of two; the presses are this times the number of "
+    "parameters and two.",
 )
 @jobs_option
 @dask_option
 def uncertainty(scene: Path, out: Path, samples: int, jobs: int | None, dask: str | None) -> None:
     """Estimate how far SCENE's press depends on what is not known of the tissue.
 
-    Stiffness of kidney and parts, attachment and friction vary over the ranges of scenes/mechanical_tissues.toml.
+    Stiffness of kidney and parts, attachment and friction vary over the ranges of
+    scenes/mechanical_tissues.toml.
     """
     make_folder(out)
     loaded, anatomy = load_patient(scene)

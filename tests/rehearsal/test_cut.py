@@ -1,4 +1,6 @@
-"""Cuts of a ball, whose volumes are those of caps, balls, cones and frusta; any cut of an ellipsoid; and what is refused."""
+"""Cuts of a ball, whose volumes are those of caps, balls, cones and frusta; any cut of an ellipsoid; and
+what is refused.
+"""
 
 from contextlib import suppress
 
@@ -42,8 +44,8 @@ from scenes.solids import solid_of, surface_of
 ORGAN = ball(R)
 LINE = line_on_ball(ORGAN)
 ABOVE = cap_mm3(R, R - HEIGHT_MM)
-# A ball's surface is inside it by a share s; arcs between marks are inside their circle by 1 - cos(pi / n): together a share of each
-# width, so twice of an area.
+# A ball's surface is inside it by a share s; arcs between marks are inside their circle by 1 - cos(pi / n):
+# together a share of each width, so twice of an area.
 WIDTH_ERROR = 2 * inset(ORGAN) + 1 - np.cos(np.pi / MARKS)
 # The cutter is simplified by 0.05 mm, all around.
 VOLUME_ERROR = 2 * WIDTH_ERROR + 3 * 0.05 / RIM_MM
@@ -86,7 +88,9 @@ def test_a_floor_at_a_depth_is_half_as_wide_as_the_line(technique):
 
 
 def test_the_walls_of_a_wedge_meet_below_the_tumour_and_its_margin():
-    """A cone from the rim that touches a ball: its half-angle has the sine (r + m) / distance of apex and centre."""
+    """A cone from the rim that touches a ball: its half-angle has the sine (r + m) / distance of apex and
+    centre.
+    """
     tumour = np.asarray(ball(3.0, (0.0, 0.0, HEIGHT_MM - 6.0)).vertices)
     made = cut(CutSettings("wedge", 2.0), tumour)
     distance = np.linalg.norm(made.resection_surface().triangles_center - [0, 0, HEIGHT_MM - 6.0], axis=1)
@@ -129,7 +133,9 @@ def test_a_wedge_has_a_ridge_along_a_long_line(long_line):
 
 @pytest.mark.parametrize("margin_mm", [0.0, 3.0])
 def test_the_walls_of_a_long_wedge_keep_the_margin_of_a_long_tumour(long_line, margin_mm):
-    """A line of points 5 mm deep: at a depth D the sides are at (D - 5) sin(angle), where tan(angle) = b / 2 D."""
+    """A line of points 5 mm deep: at a depth D the sides are at (D - 5) sin(angle), where tan(angle) = b /
+    2 D.
+    """
     block, line = long_line
     tumour = np.column_stack([np.linspace(-2.0, 9.0, 23), np.zeros(23), np.full(23, -5.0)])
     made = cut_organ(block, line, CutSettings("wedge", margin_mm), in_block(tumour))
@@ -168,7 +174,8 @@ def test_specimen_and_remnant_are_closed_and_together_the_organ(technique):
     assert made.specimen.volume + made.remnant.volume == pytest.approx(ORGAN.volume, rel=1e-9)
     bed, own = faces_of(made.remnant, made.on_remnant), made.resection_surface()
     assert bed.area == pytest.approx(own.area, rel=1e-6)
-    # The bed is within the organ, capsule faces are on the ball; a face at the rim is cut, and has the plane of its own.
+    # The bed is within the organ, capsule faces are on the ball; a face at the rim is cut, and has the plane
+    # of its own.
     capsule = faces_of(made.specimen, ~made.on_specimen)
     assert np.linalg.norm(capsule.vertices, axis=1).min() > R * (1 - 2 * inset(ORGAN))
     assert own.triangles_center[:, 2].min() < HEIGHT_MM - 5.0 and made.settings.technique == technique
@@ -321,7 +328,9 @@ def test_the_hilum_is_the_ball_that_the_attachment_holds():
 
 @pytest.mark.parametrize("share", [0.24, 0.26])
 def test_a_cut_takes_at_most_a_quarter_of_the_tissue_around_the_hilum(share):
-    """All are boxes: a third of the hilum's is outside of the organ and does not count, so that its share is that of its height above the cut."""
+    """All are boxes: a third of the hilum's is outside of the organ and does not count, so that its share
+    is that of its height above the cut.
+    """
     organ = trimesh.creation.box([40.0, 44.0, 50.0])
     hilum = trimesh.creation.box([12.0, 6.0, 20.0]).apply_translation([18.0, 3.0, -2.0])
     made = cut_by(organ, half_space(8.0 - 20.0 * share))
@@ -353,7 +362,9 @@ def test_what_is_outside_of_the_organ_stays_unless_the_part_is_within_it():
 
 
 def test_a_piece_next_to_nothing_that_rounding_leaves_is_in_neither():
-    """Beside the organ, above the score: too small to be a piece, so that it neither stays nor comes with the specimen."""
+    """Beside the organ, above the score: too small to be a piece, so that it neither stays nor comes with
+    the specimen.
+    """
     crumb = trimesh.creation.icosahedron().apply_scale(0.002).apply_translation([0.0, 0.0, R + 2.0])
     organ = trimesh.util.concatenate([ORGAN, crumb])
     made = cut_organ(organ, LINE, CutSettings("wedge", depth_mm=12.0), np.zeros((0, 3)))

@@ -1,4 +1,6 @@
-"""Undo, bookmarks, freeze, sweeps, a plan and the link in a window whose solver keeps pace with the clock, at each of its paces."""
+"""Undo, bookmarks, freeze, sweeps, a plan and the link in a window whose solver keeps pace with the clock,
+at each of its paces.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -78,7 +80,10 @@ def plan_down(rehearsal: Rehearsal, anatomy: LoadedAnatomy) -> Plan:
 
 
 # What is done in order, each for some time and frames.
-SCRIPT = "rest press rest bookmark sweep press press rest undo redo to_bookmark sweep freeze freeze press press rest"
+SCRIPT = (
+    "rest press rest bookmark sweep press press rest undo redo to_bookmark sweep freeze freeze press "
+    "press rest"
+)
 PART_S, PART_FRAMES = 0.15, 4
 
 
@@ -104,7 +109,8 @@ class LiveLink(SimpleNamespace):
         self.images += 1
 
 
-# How the pace begins, what is said then, and how many times longer than usual the steps are that it begins with.
+# How the pace begins, what is said then, and how many times longer than usual the steps are that it begins
+# with.
 PACES = {
     "as set": (lambda: pace_at(0), "", {1}),
     "longer steps": (lambda: pace_at(2), "LONGER STEPS", {2, 3, 4}),

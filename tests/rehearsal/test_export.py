@@ -54,7 +54,8 @@ def patient(tmp_path_factory) -> Path:
     (folder / "scene.toml").write_text(
         "title = 'Doe, Jane'\n[anatomy]\ntumour = 'tumour.stl'\nct = 'hu.nrrd'\nlabels = 'marks.nrrd'\n"
         "[anatomy.parts]\nvessel = 'vessels.stl'\n[anatomy.tissues]\n1 = 'cortex'\n"
-        "[[shape]]\nkind = 'mesh'\nfile = 'bed.stl'\n[[shape]]\nkind = 'plane'\nnormal = [0, 1, 0]\noffset_mm = 3\n"
+        "[[shape]]\nkind = 'mesh'\nfile = 'bed.stl'\n[[shape]]\nkind = 'plane'\nnormal = [0, 1, "
+        "0]\noffset_mm = 3\n"
         "[[shape]]\nkind = 'mesh'\nfile = 'organ.stl'\n"
     )
     return folder

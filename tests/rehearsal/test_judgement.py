@@ -137,7 +137,9 @@ def test_what_is_not_labelled_is_not_said_to_be_whole():
 
 
 def test_figures_as_cut_are_those_of_the_tissue_then():
-    """Specimen, remnant and tumour twice as large, the organ by a tenth: margins are doubled, and volumes compare."""
+    """Specimen, remnant and tumour twice as large, the organ by a tenth: margins are doubled, and volumes
+    compare.
+    """
     specimen, tumour = ball(14.0), ball(9.0)
     found = judged(cut_by(ORGAN, specimen), tumour, scale=(1.1, 2.0))
     assert found.margin_as_cut.margin_mm.min() == pytest.approx(10.0, abs=2 * 14 * inset(specimen))
@@ -235,7 +237,9 @@ def test_a_trace_is_not_written_as_zero(value, digits, text):
 
 
 def by_hand(**changed) -> Judgement:
-    """A cut of five faces: 10 mm2 2 mm deep in the tumour, 20 mm2 within the error of its surface, the others beside it."""
+    """A cut of five faces: 10 mm2 2 mm deep in the tumour, 20 mm2 within the error of its surface, the
+    others beside it.
+    """
     area, distance = np.array([10.0, 20.0, 30.0, 40.0, 50.0]), np.array([-2.0, -0.05, 0.5, 2.5, 4.0])
     values = dict(
         margin=MarginMap(np.zeros((5, 3)), area, distance),
@@ -297,7 +301,9 @@ def test_the_figures_of_a_cut_by_hand():
 
 
 def test_the_cost_of_a_cut_by_hand():
-    """100 mm2 of collecting system or a vessel of 3 mm are 1 ml, a missing millimetre 5 ml, and 1 cm2 of tumour 50 ml."""
+    """100 mm2 of collecting system or a vessel of 3 mm are 1 ml, a missing millimetre 5 ml, and 1 cm2 of
+    tumour 50 ml.
+    """
     found = cost_terms(by_hand(), 4.0)
     vessels = 0.14 * np.pi / 4 * (49.0 + 25.0 + 4.0)
     expected = {
@@ -327,7 +333,8 @@ def test_proposals_are_compared_by_their_figures():
         ["wedge", "33.5", "0.0", "16.5", "not labelled", "not labelled"],
     ]
     assert why_first([first, second]) == (
-        "The first, enucleoresection, costs 3.2 points less than the next: parenchyma 13.2 points instead of 16.5, "
+        "The first, enucleoresection, costs 3.2 points less than the next: parenchyma 13.2 points "
+        "instead of 16.5, "
         "collecting system 0.1 points instead of 0.0, vessels 8.6 points instead of 0.0."
     )
 
@@ -348,7 +355,9 @@ def test_the_page_writes_the_figures_of_the_report():
         "technique": "wedge, to the tumour's depth; air in the crater",
         "tumour surface seen": "82 %",
         "margin": "0.0 mm least, 2.1 mm mean; asked 4",
-        "less than asked": "kept only from the tumour surface seen; the score is 2.3 mm from the tumour; the walls of a wedge are straight",
+        "less than "
+        "asked": "kept only from the tumour surface seen; the score is 2.3 mm from the tumour; the walls of "
+        "a wedge are straight",
         "margin, tissue as cut": "0.6 mm least, 4.6 mm mean",
         "area below 1, 3, 5 mm": "60, 100, 150 mm2",
         "positive margin": "10 mm2; tumour left 0.44 ml",

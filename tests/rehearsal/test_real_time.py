@@ -290,7 +290,8 @@ def test_short_steps_are_made_by_the_clock(monkeypatch):
 
 def test_of_a_step_that_hangs_a_tenth_of_a_second_is_made_up_for(monkeypatch):
     loop = ClockedLoop(monkeypatch, 0, [], end_s=2.0, hangs_s=1.0)
-    # A tenth of a second and a step are seven sixtieths, one after the other; then steps of 10 ms are made by the clock again.
+    # A tenth of a second and a step are seven sixtieths, one after the other; then steps of 10 ms are made by
+    # the clock again.
     made_up = [at_s for at_s, _, _ in loop.begun if 1.0 < at_s < 1.0 + 1 / 60 + 0.0701]
     assert np.diff(made_up) == pytest.approx([0.01] * (len(made_up) - 1)) and len(made_up) == 7
     simulated_s = sum(sixtieths for _, sixtieths, _ in loop.begun) / 60
@@ -340,7 +341,8 @@ def collected_at(monkeypatch, steps: list[tuple[float, float, bool]], inputs_s: 
 
 
 def test_a_picture_waits_for_the_step_of_its_input_where_steps_wait_for_inputs(monkeypatch):
-    # The first input knows of no step that waited; the third is on its way when the second step for the input before comes.
+    # The first input knows of no step that waited; the third is on its way when the second step for the input
+    # before comes.
     steps = [(0.1, 0.1, True), (0.215, 0.2, True), (0.305, 0.2, True), (0.32, 0.3, True)]
     assert collected_at(monkeypatch, steps, [0.1, 0.2, 0.3]) == pytest.approx([0.1, 0.215, 0.32])
 
@@ -419,7 +421,9 @@ LEVELS = [(1, 1.0), (2, 1.0), (3, 1.0), (4, 1.0), (4, 0.75), (4, 0.5), (4, 0.25)
 
 @pytest.mark.parametrize("load", [0.4, 0.6, 0.69, 0.95, 1.2, 1.45, 1.9, 2.3, 2.6, 2.75, 3.6, 4.2, 7.0, 20.0])
 def test_a_machine_of_one_speed_goes_to_one_level_and_stays(load):
-    """A step takes as long as its iterations; of five, one is half as long again, and one takes hardly any time."""
+    """A step takes as long as its iterations; of five, one is half as long again, and one takes hardly any
+    time.
+    """
     pace, levels = Pace(1 / 60), [0]
     for number in range(12 * STEPS_UP):
         unsteady = (1.0, 1.0, 1.5, 0.1, 1.0)[number % 5]

@@ -148,7 +148,8 @@ def test_a_pixel_is_where_its_matrix_says():
     probe = load_probe("curvilinear")
     width, depth, above = probe.extent_mm
     matrix = probe.image_to_probe(300, 400)
-    # The middle of the last row is the deepest place of the middle line; the first pixel's corner lies behind the face.
+    # The middle of the last row is the deepest place of the middle line; the first pixel's corner lies behind
+    # the face.
     assert matrix @ [199.5, 299.5, 0, 1] == pytest.approx([0.0, depth - above, 0, 1])
     assert matrix @ [-0.5, -0.5, 0, 1] == pytest.approx([-width / 2, -above, 0, 1])
 

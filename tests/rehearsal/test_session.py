@@ -1,4 +1,7 @@
-"""The file of a session: what becomes of it on a disk, in a crash, and by other hands. ``test_timeline`` replays any session."""
+"""The file of a session: what becomes of it on a disk, in a crash, and by other hands.
+
+``test_timeline`` replays any session.
+"""
 
 import base64
 import errno

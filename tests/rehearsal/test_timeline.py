@@ -1,4 +1,6 @@
-"""The timeline: undo, redo, bookmarks, marks and settings in any order, and a session's file that repeats them to the bit."""
+"""The timeline: undo, redo, bookmarks, marks and settings in any order, and a session's file that repeats
+them to the bit.
+"""
 
 import tempfile
 from pathlib import Path
@@ -55,7 +57,9 @@ def good_of(timeline: Timeline) -> bytes:
 
 
 def repeated(path: Path, at_s: float = 0.0) -> tuple[Timeline, ReplayCheck]:
-    """A timeline after the replay of a session from the last whole state before a time [s], and its comparison."""
+    """A timeline after the replay of a session from the last whole state before a time [s], and its
+    comparison.
+    """
     log = read_log(path)
     replay, check = Replay(log, one_by_one=True), ReplayCheck(log, Notices())
     stepper = LocalStepper(fake_timeline())

@@ -1,4 +1,6 @@
-"""The page behind the 3D view: parts that do not overlap, texts that fit, and what is written over pictures."""
+"""The page behind the 3D view: parts that do not overlap, texts that fit, and what is written over
+pictures.
+"""
 
 from itertools import combinations
 
@@ -386,7 +388,8 @@ def test_what_points_up_in_the_compass_is_drawn_up():
 
 def test_of_two_letters_at_one_place_the_nearer_is_shown():
     near = [(5.0, 0.0), (0.0, 0.0), (9.0, 0.0), (10.0, 0.0)]
-    # The second is far from what is shown, the first is not hidden by it, and the third is hidden by the last.
+    # The second is far from what is shown, the first is not hidden by it, and the third is hidden by the
+    # last.
     assert are_apart(np.array(near), 5.0) == [True, True, False, True]
     assert are_apart(np.array(near), 5.5) == [False, True, False, True]
     # Seen along a diagonal of left and back: two letters of the four stay, the nearer one on each side.

@@ -111,7 +111,8 @@ def test_a_file_changes_behaviour_help_and_words(tmp_path):
     keys = load_keys(
         file_of(
             tmp_path,
-            '[keys]\npush = "i"\nexport = "w"\nfreeze = "space"\nhelp = "Return"\nplan_for = "f"\nplan = "h"\n[gamepad]\nundo = "guide"\nredo = "b"\n',
+            '[keys]\npush = "i"\nexport = "w"\nfreeze = "space"\nhelp = "Return"\nplan_for = "f"\nplan = '
+            '"h"\n[gamepad]\nundo = "guide"\nredo = "b"\n',
         )
     )
     assert [keys.action_of(key) for key in ("i", "w", " ", "f", "h", "F1", "Return", "Escape")] == [

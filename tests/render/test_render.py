@@ -128,7 +128,8 @@ def test_the_parts_of_the_transducer_are_closed_and_face_outward(radius):
         assert np.all(np.einsum("ikj,ikj->ik", normals, corners - middle) > 0)
         # The area vectors of a closed surface add up to nothing.
         assert cross.sum(axis=0) == pytest.approx(np.zeros(3), abs=1e-9)
-    # The marker stands out by a quarter of a millimetre; a curved array is lowest in its centre, where the image starts.
+    # The marker stands out by a quarter of a millimetre; a curved array is lowest in its centre, where the
+    # image starts.
     assert shape.vertices.min(axis=0) == pytest.approx(-size / 2)
     assert shape.vertices.max(axis=0)[:2] == pytest.approx(size[:2] / 2 + [0.25, 0.0])
 
@@ -275,7 +276,8 @@ def test_organ_is_drawn_where_the_camera_projects_it(window):
         picture = opened.picture()
         rows, columns = np.nonzero(np.any(picture != empty, axis=2))
         assert _organ_pixels(picture).sum() > len(rows) / 2
-        # The outline of the vertices, in pixels from the bottom left. A pixel is drawn if its middle is inside.
+        # The outline of the vertices, in pixels from the bottom left. A pixel is drawn if its middle is
+        # inside.
         outline = opened.camera.project(moved) * [640, 360]
         drawn = [[columns.min(), 360 - rows.max() - 1], [columns.max() + 1, 360 - rows.min()]]
         assert np.allclose(drawn, [outline.min(axis=0), outline.max(axis=0)], atol=1.0)
@@ -313,8 +315,8 @@ def test_processor_and_vulkan_draw_the_same_picture(window):
         opened.draw(_view())
         shown[by_processor] = opened.picture()[opened.layout.scene.slices].astype(int)
     away = np.abs(shown[True] - shown[False]).max(axis=2)
-    # The view has no more than 2 % of its pixels at edges of organ, transducer and image plane; inside, colours are rounded once for
-    # each layer that is blended.
+    # The view has no more than 2 % of its pixels at edges of organ, transducer and image plane; inside,
+    # colours are rounded once for each layer that is blended.
     assert np.mean(away > 3) < 0.02 and np.ptp(shown[True]) > 100
 
 
@@ -340,7 +342,9 @@ def test_two_pictures_of_one_view_are_the_same(window):
 
 
 class Mouse:
-    """Stands for GGUI's window: a mouse at a pixel of a window of 640 x 360, and what was pressed and released since the last frame."""
+    """Stands for GGUI's window: a mouse at a pixel of a window of 640 x 360, and what was pressed and
+    released since the last frame.
+    """
 
     running = True
 

@@ -1,4 +1,6 @@
-"""The 3D view that the processor draws, against a slow drawing of the same triangles pixel by pixel in float64."""
+"""The 3D view that the processor draws, against a slow drawing of the same triangles pixel by pixel in
+float64.
+"""
 
 import numpy as np
 import pytest

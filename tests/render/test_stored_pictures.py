@@ -1,7 +1,9 @@
-"""Pictures of one scene against those that are stored in tests/pictures: what no closed form tells may not change unseen.
+"""Pictures of one scene against those that are stored in tests/pictures: what no closed form tells may not
+change unseen.
 
-Where a change of the pictures is meant, ``pytest tests/render/test_stored_pictures.py --renew-pictures`` stores the new ones: look at them
-before they are committed. Without a Vulkan driver the 3D view is skipped, and not renewed.
+Where a change of the pictures is meant, ``pytest tests/render/test_stored_pictures.py --renew-pictures``
+stores the new ones: look at them before they are committed. Without a Vulkan driver the 3D view is skipped,
+and not renewed.
 """
 
 from pathlib import Path
@@ -39,9 +41,11 @@ PROBE = Probe(
     depth_mm=DEPTH,
 )
 FACE, DOWN, LATERAL = np.array([1.0, -0.5, 11.0]), np.array([0.15, 0.1, -1.0]), np.array([1.0, 0.3, 0.0])
-# Two pictures are alike that differ by so little: by mean grey value, and by the share of pixels that are more than SEEN off.
-# CT and B-mode: other rounding (no fast_math, LLVM's advanced optimisation) leaves 0.004 and none, the organ's points 1e-4 mm
-# off 0.03 and 0.01 %. 3D view: another driver may draw edges half a pixel off, which leaves 0.5 and 0.1 %.
+# Two pictures are alike that differ by so little: by mean grey value, and by the share of pixels that are
+# more than SEEN off.
+# CT and B-mode: other rounding (no fast_math, LLVM's advanced optimisation) leaves 0.004 and none, the
+# organ's points 1e-4 mm off 0.03 and 0.01 %. 3D view: another driver may draw edges half a pixel off, which
+# leaves 0.5 and 0.1 %.
 LIMITS = {CT: (0.2, 0.001), B_MODE: (0.2, 0.001), "3D": (1.0, 0.005)}
 SEEN = 12
 # What a millimetre or a degree of the probe must exceed one of them by.
@@ -82,7 +86,9 @@ class Scene:
         )
 
     def plane(self, shift: np.ndarray, turn: np.ndarray) -> ImagePlane:
-        """The image plane of the probe shifted by so much along its own axes [mm], and turned about them at its face."""
+        """The image plane of the probe shifted by so much along its own axes [mm], and turned about them
+        at its face.
+        """
         axes = pose_at(FACE, DOWN, LATERAL, 20.0)[:3, :3]
         face, axes = FACE + axes @ shift, axes @ turn
         return image_plane(pose_at(face, -axes[:, 2], axes[:, 0], 20.0), 20.0, WIDTH, DEPTH)

@@ -51,7 +51,8 @@ def test_a_surface_is_shaded_by_the_formulas(device, opacity, is_cut):
     tinted = mesh.vertices[:, 0] > 3.0
     surface.tint(tinted)
     surface.shade(EYE, LIGHT, opacity, CUT if is_cut else None)
-    # Edges of 1 mm between float32 places of 14 mm are 1e-6 off, so are normals; the power multiplies this by 36.
+    # Edges of 1 mm between float32 places of 14 mm are 1e-6 off, so are normals; the power multiplies this by
+    # 36.
     assert array_of(surface.normal) == pytest.approx(normals_of(mesh), abs=1e-5)
     wanted = colours_of(mesh, opacity, tinted, is_cut)
     assert array_of(surface.colour) == pytest.approx(wanted, abs=1e-4 if is_cut else 2e-5)

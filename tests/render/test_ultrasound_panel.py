@@ -139,8 +139,8 @@ def test_a_status_is_as_large_as_it_can_be_in_the_panel(size, status):
     columns = np.flatnonzero(np.any(plain != with_status, axis=(0, 2)))
     room = layout.panel.width - 2 * layout.px(16)
     assert layout.status.width == room
-    # The usual font where that fits, but for the room beside its first and last letter; else one size more would not, which
-    # makes it wider by a ninth at most.
+    # The usual font where that fits, but for the room beside its first and last letter; else one size more
+    # would not, which makes it wider by a ninth at most.
     usual = font(layout.px(17)).getlength(status)
     fits = usual <= room
     assert (

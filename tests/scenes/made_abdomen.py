@@ -1,4 +1,6 @@
-"""A CT of an abdomen from closed forms, in LPS [mm], and what each voxel of it is: only one kidney is labelled."""
+"""A CT of an abdomen from closed forms, in LPS [mm], and what each voxel of it is: only one kidney is
+labelled.
+"""
 
 from dataclasses import dataclass
 
@@ -29,7 +31,9 @@ NOISE_HU = 8.0
 
 @dataclass(frozen=True)
 class Abdomen:
-    """HU and labels (nx, ny, nz), the kidney's surface, and the ``truth``: a structure's name at each voxel."""
+    """HU and labels (nx, ny, nz), the kidney's surface, and the ``truth``: a structure's name at each
+    voxel.
+    """
 
     hu: np.ndarray
     labels: np.ndarray
@@ -78,7 +82,8 @@ def abdomen(
     mirrored=(False, False, False),
     others=(),
 ) -> Abdomen:
-    """The abdomen, of which a kidney is labelled, in voxels of a spacing along x, y and z, stored with its axes in an order and mirrored.
+    """The abdomen, of which a kidney is labelled, in voxels of a spacing along x, y and z, stored with its
+    axes in an order and mirrored.
 
     ``others`` are pairs of a structure and its HU, where these are not the usual ones.
     """

@@ -1,4 +1,6 @@
-"""Every form of labels on a CT of any view: the surface has the volume and place that SimpleITK measures in the voxels."""
+"""Every form of labels on a CT of any view: the surface has the volume and place that SimpleITK measures
+in the voxels.
+"""
 
 import gzip
 
@@ -88,8 +90,10 @@ def slicer(folder, _, image):
     steps = to_ras @ np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()
     lines = [
         "NRRD0004", "type: uint8", "dimension: 4", "space: right-anterior-superior",
-        f"sizes: 2 {' '.join(map(str, image.GetSize()))}", f"space directions: none {' '.join(map(vector, steps.T))}",
-        "kinds: list domain domain domain", "encoding: gzip", f"space origin: {vector(to_ras @ image.GetOrigin())}",
+        "sizes: 2 "
+        f"{' '.join(map(str, image.GetSize()))}", f"space directions: none {' '.join(map(vector, steps.T))}",
+        "kinds: list domain domain "
+        "domain", "encoding: gzip", f"space origin: {vector(to_ras @ image.GetOrigin())}",
         *(f"Segment0_{key}:={value}" for key, value in LAYER.items()),
     ]  # fmt: skip
     voxels = np.stack([np.zeros_like(inside), inside], axis=-1)

@@ -54,7 +54,9 @@ class TestBedOfLabels:
         assert (distance < 0).tolist() == [False, True, True, True]
 
     def test_beside_the_organ_it_is_the_muscle(self, patient):
-        """Away from the organ, within the bed's reach, vertices lie on the muscle or on the bed's own ends."""
+        """Away from the organ, within the bed's reach, vertices lie on the muscle or on the bed's own
+        ends.
+        """
         vertices, bounds = patient.support.vertices, patient.support.bounds
         ends = (np.abs(vertices - bounds[0]) < 3).any(axis=1) | (np.abs(vertices - bounds[1]) < 3).any(axis=1)
         under = (((vertices - LEFT[0])[:, [0, 2]] / (LEFT[1][[0, 2]] + 4)) ** 2).sum(axis=1) < 1
@@ -95,7 +97,8 @@ class TestBedOfFile:
         for name, mesh in (("inside", inside), ("far", far), ("open", open_)):
             mesh.export(tmp_path / f"{name}.stl")
         (tmp_path / "text.stl").write_text("no surface")
-        # Where x and y of the ellipsoid are equal, 15.6 mm, its surface is 4.4 mm inside the cube's; the other's face is at x = -280 mm.
+        # Where x and y of the ellipsoid are equal, 15.6 mm, its surface is 4.4 mm inside the cube's; the
+        # other's face is at x = -280 mm.
         for name, words in [
             ("inside", r"reaches [45]\.\d mm into the organ"),
             ("far", r"is 32[3-7] mm from the organ"),
@@ -182,13 +185,16 @@ class TestUnderTheOrgan:
             bed_of_file(tmp_path / "mould.stl", organ, gravity)
 
     def test_gaps_are_those_along_gravity(self, organ):
-        """Under an ellipsoid, at a share s of its projected area, a plane d below is d + c (1 - sqrt(1 - s)) away."""
+        """Under an ellipsoid, at a share s of its projected area, a plane d below is d + c (1 - sqrt(1 -
+        s)) away.
+        """
         slab = trimesh.creation.box([120.0, 10.0, 120.0])
         slab.apply_translation(LEFT[0] + [0, LEFT[1][1] + 2 + 5, 0])
         gaps, covered = vertical_gaps(slab, organ, SUPINE)
         shares = (np.arange(len(gaps)) + 0.5) / len(gaps)
         expected = 2 + LEFT[1][1] * (1 - np.sqrt(1 - shares))
-        # The number of rays within an ellipse is its area's to about a ray in each row of 12; there are 22 mm per share at most.
+        # The number of rays within an ellipse is its area's to about a ray in each row of 12; there are 22 mm
+        # per share at most.
         inner = shares < 0.8
         assert len(gaps) > 150 and not covered.any()
         assert np.abs(np.sort(gaps) - expected)[inner].max() < 22 * 12 / len(gaps)

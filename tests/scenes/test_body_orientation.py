@@ -1,4 +1,6 @@
-"""A header that turns or mirrors a CT is contradicted by its anatomy, as far as the CT shows it; a correct one never is."""
+"""A header that turns or mirrors a CT is contradicted by its anatomy, as far as the CT shows it; a correct
+one never is.
+"""
 
 from dataclasses import replace
 from functools import cache
@@ -65,7 +67,9 @@ def test_the_overview_has_the_voxels_nearest_to_15_tenths_of_a_mm_in_place():
 
 @pytest.mark.parametrize("spacing_z, is_lung", [(4.0, True), (3.99, False)])
 def test_gas_in_the_body_is_a_lung_from_150_ml_on(spacing_z, is_lung):
-    """A box of 12 x 16 x 13 cells without its edges, which an opening takes: 2348 cells, of 150.3 ml or 149.9 ml."""
+    """A box of 12 x 16 x 13 cells without its edges, which an opening takes: 2348 cells, of 150.3 ml or
+    149.9 ml.
+    """
     mean = np.full((30, 30, 30), -1000.0)
     mean[:, 3:27, 3:27] = 0.0
     mean[8:21, 7:23, 9:21] = -800.0

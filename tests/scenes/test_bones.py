@@ -18,7 +18,9 @@ def ball(centre_mm: tuple[float, float, float], radius_mm: float) -> np.ndarray:
 
 
 def abdomen() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """HU of fat with a bone cut by the CT's border, a kidney and a vessel, all but the fat as bright as contrast agent makes them."""
+    """HU of fat with a bone cut by the CT's border, a kidney and a vessel, all but the fat as bright as
+    contrast agent makes them.
+    """
     hu = np.full((80, 70, 60), FAT, np.float32)
     bone, kidney, vessel = (
         ball((0.0, 30.0, 27.0), 16.0),

@@ -239,7 +239,9 @@ def test_long_text_ends_above_the_names_of_the_colours(patient, tmp_path):
 
 
 def test_the_summary_has_the_measures_of_the_labels(patient):
-    """An ellipsoid of half axes 25, 20 and 45 mm, and a ball of 11 mm that goes 8 mm beyond it to the left."""
+    """An ellipsoid of half axes 25, 20 and 45 mm, and a ball of 11 mm that goes 8 mm beyond it to the
+    left.
+    """
     values = sitk.GetArrayFromImage(body(spacing=(3.0, 3.0, 3.0))[1])
     volumes = dict(organ=np.isin(values, [2, 3]).sum() * 0.027, tumour=(values == 3).sum() * 0.027)
     assert patient.volumes_ml == pytest.approx(volumes)
@@ -257,7 +259,9 @@ def test_the_summary_has_the_measures_of_the_labels(patient):
 
 
 def test_the_complexity_of_the_tumour_is_in_the_summary(patient):
-    """The tumour is a ball of 11 mm that protrudes half from the left kidney, towards the front and the head."""
+    """The tumour is a ball of 11 mm that protrudes half from the left kidney, towards the front and the
+    head.
+    """
     rows = dict(summary_rows(patient, complexity_of_patient(patient)))
     assert rows["size"].startswith("2") and "exophytic" in rows["size"]
     assert "R 1 (2" in rows["R.E.N.A.L."] and "N 1-3" in rows["R.E.N.A.L."] and "size 1" in rows["PADUA"]

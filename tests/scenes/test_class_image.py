@@ -1,4 +1,6 @@
-"""The class image of a patient: written for 3D Slicer, corrected, imported beside the labels, and written again."""
+"""The class image of a patient: written for 3D Slicer, corrected, imported beside the labels, and written
+again.
+"""
 
 import re
 from pathlib import Path
@@ -283,7 +285,9 @@ def test_a_class_image_alone_is_no_organ(files, first, tmp_path, capsys):
 
 
 def test_what_was_drawn_in_a_corrected_tissue_is_corrected_with_it(tmp_path):
-    """Layers in a muscle that is a liver: 3D Slicer shows them as a segment of their own, which nobody needs to paint over."""
+    """Layers in a muscle that is a liver: 3D Slicer shows them as a segment of their own, which nobody
+    needs to paint over.
+    """
     grid, hu, coded = made(THIN, ENHANCED_HU, [])
     hu[points_of(grid.image(coded))[..., 1] > KIDNEY[0][1] + KIDNEY[1][1] + 6] = 60.0
     own = codes_of_labels(coded.transpose(2, 1, 0), {1: "kidney"})

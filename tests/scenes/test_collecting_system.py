@@ -78,7 +78,8 @@ def test_what_is_dense_by_one_hu_too_little_is_parenchyma(level):
 
 
 def test_the_enhanced_phase_begins_between_plain_and_enhanced_parenchyma_whatever_is_dense_in_it():
-    # Without contrast agent parenchyma has 30 to 50 HU, with it more than 100, though a sixth of it be a dense piece.
+    # Without contrast agent parenchyma has 30 to 50 HU, with it more than 100, though a sixth of it be a
+    # dense piece.
     piece = box((12, 22), (8, 28), (8, 28))
     assert piece.sum() / PARENCHYMA.sum() > 0.1
     assert not any(pieces(kidney_of(level, piece, 600.0)).is_enhanced for level in (20.0, 50.0, 60.0))
@@ -88,7 +89,9 @@ def test_the_enhanced_phase_begins_between_plain_and_enhanced_parenchyma_whateve
 @pytest.mark.parametrize("level, kind", [(PLAIN, "stone"), (ENHANCED, "urine")])
 @pytest.mark.parametrize("turn", list(permutations(range(3)))[:4])
 def test_a_piece_belongs_to_a_kidney_that_holds_enough_of_it_and_continues_outside(level, kind, turn):
-    """A rod that begins in the hollow and leaves it: with a larger share inside it is the pelvis and ureter, with a smaller one a bone beside."""
+    """A rod that begins in the hollow and leaves it: with a larger share inside it is the pelvis and
+    ureter, with a smaller one a bone beside.
+    """
     for inside, is_own in ((round(10 * LEAST_SHARE) + 1, True), (round(10 * LEAST_SHARE) - 1, False)):
         piece = box((50 - inside, 60 - inside), (24, 27), (18, 21))
         hu = kidney_of(level, piece, 300.0)
@@ -148,13 +151,16 @@ def test_urine_is_8_to_27_hu_darker_than_plain_parenchyma_and_minus_10_to_35_hu_
 
 @pytest.mark.parametrize(("radius", "is_seen"), [(6.15, False), (6.7, True)])
 def test_a_pelvis_is_seen_from_a_volume_on(radius, is_seen):
-    """A ball in voxels that differ along each axis, each a cell of its own, so that distances are those of the voxels' centres."""
+    """A ball in voxels that differ along each axis, each a cell of its own, so that distances are those of
+    the voxels' centres.
+    """
     spacing = np.array([1.4, 1.5, 1.7])
     places = AT * spacing
     pelvis = np.linalg.norm(places - MIDDLE * spacing, axis=-1) <= radius
     core = cKDTree(places[~pelvis]).query(places[pelvis])[0] >= PELVIS_MM
     near = cKDTree(places[pelvis][core]).query(places[pelvis])[0] <= PELVIS_MM
-    # The ball that is sought fits into both; one has up to a fifth less than the least volume, the other more.
+    # The ball that is sought fits into both; one has up to a fifth less than the least volume, the other
+    # more.
     volume_ml = near.sum() * spacing.prod() / 1000
     assert (
         core.any() and abs(volume_ml / LEAST_PELVIS_ML - 1) < 0.2 and (volume_ml > LEAST_PELVIS_ML) == is_seen

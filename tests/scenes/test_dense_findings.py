@@ -1,4 +1,6 @@
-"""What an import says of contrast agent and stones, against what the tissue map shows of the same patients."""
+"""What an import says of contrast agent and stones, against what the tissue map shows of the same
+patients.
+"""
 
 import re
 from functools import cache
@@ -31,7 +33,9 @@ def organ() -> trimesh.Trimesh:
 
 
 def made(spacing, kidney_hu, bright, labelled=None):
-    """The CT (z, y, x) of a kidney in fat with bright pieces, of which one is labelled as urine, and its labels."""
+    """The CT (z, y, x) of a kidney in fat with bright pieces, of which one is labelled as urine, and its
+    labels.
+    """
     image = grid_around(KIDNEY[0] - 50, KIDNEY[0] + 50, spacing)
     points = points_of(image)
     hu = np.where(level(points, KIDNEY) < 0, kidney_hu, FAT_HU)

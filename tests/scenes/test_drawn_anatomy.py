@@ -64,7 +64,8 @@ def test_they_become_narrower_towards_the_sinus_and_reach_it(pyramids):
     reached = [np.isin(reach, np.unique(reach[parts == n])) & near for n in large]
     # Those of the poles, where the sinus is far, too.
     assert np.mean([each.any() for each in reached]) > 0.8
-    # A cone's section falls from its base to its papilla; layers of equal distance to the sinus as a part of the whole path.
+    # A cone's section falls from its base to its papilla; layers of equal distance to the sinus as a part of
+    # the whole path.
     share = FROM_SINUS / (FROM_SINUS + DEPTH)
     inner, outer = (
         (share > low) & (share < low + 0.15) & PARENCHYMA & (DEPTH > CORTEX_MM) for low in (0.15, 0.55)
@@ -85,7 +86,9 @@ def test_a_kidney_whose_sinus_is_unknown_has_pyramids_too_and_a_thin_one_none():
 
 @pytest.fixture(scope="module")
 def fascia() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fascia and fat about a kidney that is 22 mm before a plane of muscle; and the distance to that plane [mm]."""
+    """Fascia and fat about a kidney that is 22 mm before a plane of muscle; and the distance to that plane
+    [mm].
+    """
     away = np.linalg.norm(AT / [12.0, 12.0, 30.0], axis=-1)
     kidney, muscle = away < 1, AT[..., 1] > 20.0
     distance = ndimage.distance_transform_edt(~kidney, sampling=SPACING)
@@ -117,14 +120,17 @@ def test_layers_of_muscle_are_thin_sheets_in_it():
 
 
 def test_sheets_in_muscle_are_broken_as_noise_smoothed_over_4_mm_is():
-    """How often noise of a Gaussian correlation exp(-d^2 / (4 s^2)) crosses a level u: exp(-u^2 / 2) / (pi sqrt(2) s) (Rice 1945)."""
+    """How often noise of a Gaussian correlation exp(-d^2 / (4 s^2)) crosses a level u: exp(-u^2 / 2) / (pi
+    sqrt(2) s) (Rice 1945).
+    """
     muscle = AT[..., 1] > 2.0
     sheets = draw_perimysium(muscle, SPACING)
     layer = sheets[:, sheets.sum(axis=(0, 2)).argmax()]
     crossings = np.count_nonzero(np.diff(layer, axis=1)) / (
         layer.shape[0] * (layer.shape[1] - 1) * SPACING[2]
     )
-    # Noise has one value in a cell of about s, and is linear between: it crosses the level in fewer places, and by chance.
+    # Noise has one value in a cell of about s, and is linear between: it crosses the level in fewer places,
+    # and by chance.
     assert crossings == pytest.approx(
         np.exp(-(SHEETS_ABOVE**2) / 2) / (np.pi * np.sqrt(2) * SHEETS_OVER_MM / 2), rel=0.3
     )

@@ -1,7 +1,8 @@
-"""Imports as they happen in the field, each with a known truth: right, or refused in words, and never wrong without a word.
+"""Imports as they happen in the field, each with a known truth: right, or refused in words, and never wrong
+without a word.
 
-Eight kinds: sides exchanged, contours, derived regions, names, slices that nobody segmented, writers of SEG and RTSTRUCT,
-privacy, planes of contours.
+Eight kinds: sides exchanged, contours, derived regions, names, slices that nobody segmented, writers of SEG
+and RTSTRUCT, privacy, planes of contours.
 """
 
 import unicodedata
@@ -90,7 +91,9 @@ def slicer(path: Path, image, named):
 
 
 def section(solid, origin, direction=DIRECTIONS["identity"], count=48):
-    """The contour (n, 3) of an ellipsoid on a plane through a place, along two axes of a direction; None where there is none."""
+    """The contour (n, 3) of an ellipsoid on a plane through a place, along two axes of a direction; None
+    where there is none.
+    """
     centre, axes = solid
     plane = direction[:, :2] / axes[:, None]
     start = (np.asarray(origin) - centre) / axes
@@ -256,7 +259,10 @@ def test_forms_that_state_their_axes(ct, tmp_path, form):
     ids=str,
 )
 def test_a_header_that_lies(ct, tmp_path, axes, of_ct, word):
-    """Voxels are turned around and the header is not: the anatomy objects. A liver shows also where the head is."""
+    """Voxels are turned around and the header is not: the anatomy objects.
+
+    A liver shows also where the head is.
+    """
     image = written(tmp_path / "ct.nrrd", flipped(ct[0], axes)) if of_ct else ct[1]
     labels = written(tmp_path / "labels.nrrd", kits(ct[0], axes))
     assert any(word in line for line in import_request(image, [labels], **KITS).warnings)
@@ -335,8 +341,10 @@ HOLES = [circle(70, 35, corners[0, 2], 6) for corners in WIDE]
 SAME = {
     "cut in two that share an edge": [half for c in PLAIN for half in halves(c, 0)],
     "closed explicitly, each point twice": [np.repeat(np.vstack([c, c[:1]]), 2, axis=0) for c in PLAIN],
-    "any order, both directions": [PLAIN[n][:: 1 - 2 * (n % 2)] for n in np.random.default_rng(1).permutation(23)],
-    "clicks of one to three points": [*PLAIN, *(c[:1] for c in PLAIN), *(c[:2] for c in PLAIN), PLAIN[9][[0, 3, 0]]],
+    "any order, both "
+    "directions": [PLAIN[n][:: 1 - 2 * (n % 2)] for n in np.random.default_rng(1).permutation(23)],
+    "clicks of one to three "
+    "points": [*PLAIN, *(c[:1] for c in PLAIN), *(c[:2] for c in PLAIN), PLAIN[9][[0, 3, 0]]],
     "self-crossing by a misplaced point": [c[[*range(20), 21, 20, *range(22, 48)]] for c in PLAIN],
     "specks": [*PLAIN, circle(20, -60, -20, 0.5), circle(71, 36, 8, 1.0)],
 }  # fmt: skip
@@ -359,7 +367,8 @@ def test_contours_that_stand_twice(of_regions, second):
 
 
 @pytest.mark.parametrize(
-    "second", [lambda c: c + (2.4, 0, 0), lambda c: c + (4, 0, 0), lambda c: shrunk(c, 0.9)], ids=["0.6 pixels", "a pixel", "two millimetres"]
+    "second", [lambda c: c + (2.4, 0, 0), lambda c: c + (4, 0, 0), lambda c: shrunk(c, 0.9)], ids=["0.6 "
+            "pixels", "a pixel", "two millimetres"]
 )  # fmt: skip
 def test_contours_that_nearly_stand_twice(of_regions, second):
     """Two observers' contours in one region: the kidney must not become the rim between them."""
@@ -381,7 +390,9 @@ def test_contours_that_overlap(tmp_path):
 
 @pytest.mark.parametrize("kind", ["clockwise", "keyhole"])
 def test_holes(of_regions, kind):
-    """A hole is a contour of its own, in either direction, or is led to by a channel: the warning tells of the hollow."""
+    """A hole is a contour of its own, in either direction, or is led to by a channel: the warning tells of
+    the hollow.
+    """
     ends = [c for c in PLAIN if not any(c is one for one in WIDE)]
     channels = [np.vstack([c, c[:1], h[::-1], h[-1:]]) for c, h in zip(WIDE, HOLES, strict=True)]
     contours = [*PLAIN, *(h[::-1] for h in HOLES)] if kind == "clockwise" else [*ends, *channels]
@@ -457,7 +468,9 @@ def test_the_kidney_without_its_tumour(of_regions, name):
 
 
 def test_a_kidney_covered_by_kidney_and_tumour(of_regions):
-    """A kidney, the kidney with the tumour, and the tumour: the refusal must not say that there is no kidney."""
+    """A kidney, the kidney with the tumour, and the tumour: the refusal must not say that there is no
+    kidney.
+    """
     regions = {"Kidney_L": PLAIN, "Kidney_L incl GTV": stack(grown(LEFT, 2)), "GTV": stack(TUMOUR)}
     patient, words = words_of(lambda: of_regions(regions))
     assert is_right(patient) or "“Kidney_L”" in words, words
@@ -495,7 +508,9 @@ def test_a_name_as_it_is_shown(of_segments):
 
 
 def test_names_that_are_other_values(of_segments):
-    """Segment 1 is named 2, and segment 2 is named 1: a number is refused as ambiguous, or one of both meanings."""
+    """Segment 1 is named 2, and segment 2 is named 1: a number is refused as ambiguous, or one of both
+    meanings.
+    """
     named = [("2", LEFT), ("1", TUMOUR), ("Kidney_R", RIGHT)]
     patient, words = words_of(lambda: of_segments(named, organ=["2"], tissues={"tumour": ["1"]}))
     assert is_right(patient) or ("2" in words and ("name" in words and "value" in words)), words
@@ -521,12 +536,16 @@ def test_names_that_differ_in_accents(of_segments):
 
 @pytest.mark.parametrize("name", ["Nierentu links", "renal Ca", "Kidney nádor", "kidney target"])
 def test_a_finding_named_after_the_kidney(of_regions, name):
-    """A small region in the kidney is no second drawing of it: it is the tumour, or a warning tells that it was left out."""
+    """A small region in the kidney is no second drawing of it: it is the tumour, or a warning tells that
+    it was left out.
+    """
     patient = of_regions({"Kidney_L": PLAIN, name: stack(TUMOUR)})
     assert patient.tumour or any(name in line for line in patient.warnings), patient.notes
 
 
-@pytest.mark.parametrize("name, tissue", [("Left kidney pelvis", "urine"), ("Nierensinus", "sinus"), ("sinus renal", "sinus")])  # fmt: skip
+@pytest.mark.parametrize("name, "
+            "tissue", [("Left kidney "
+            "pelvis", "urine"), ("Nierensinus", "sinus"), ("sinus renal", "sinus")])  # fmt: skip
 def test_hollows_named_after_the_kidney(of_segments, name, tissue):
     """Pelvis and sinus are no parenchyma."""
     patient = of_segments([("Kidney_L", LEFT), (name, (LEFT[0] - (10, 0, 0), np.array([9.0, 9.0, 18.0])))])
@@ -584,7 +603,9 @@ def test_a_known_structure_in_the_kidney(of_segments, name):
 
 
 def test_a_named_tumour_apart(of_segments):
-    """A tumour a centimetre from the kidney is left out: a warning tells so, as of one that the user named."""
+    """A tumour a centimetre from the kidney is left out: a warning tells so, as of one that the user
+    named.
+    """
     patient = of_segments([("Kidney_L", LEFT), ("Tumor", (np.array([116.0, 35.0, 12.0]), np.full(3, 12.0)))])
     assert any("tumour" in line for line in patient.warnings)
 
@@ -611,10 +632,13 @@ def without(image, solid, slices, axis=0):
 
 
 @pytest.mark.parametrize(
-    "slices, z", [([13], "-20.0"), ([30], "48.0"), ([24], "24.0"), ([18, 19], "0.0")], ids=["cyst", "pole", "tumour", "two"]
+    "slices, "
+    "z", [([13], "-20.0"), ([30], "48.0"), ([24], "24.0"), ([18, 19], "0.0")], ids=["cyst", "pole", "tumour", "two"]
 )  # fmt: skip
 def test_missing_slices_of_a_kidney(ct, of_segments, slices, z):
-    """One or two slices of 4 mm, also bridged by a cyst or tumour: interpolated, and named by their places."""
+    """One or two slices of 4 mm, also bridged by a cyst or tumour: interpolated, and named by their
+    places.
+    """
     named = [("Kidney_L", without(ct[0], LEFT, slices)), ("Tumor", TUMOUR), ("Cyst", CYST)]
     patient = of_segments(named)
     assert_right(patient, organ_ml=101.9, warnings=1)
@@ -623,7 +647,9 @@ def test_missing_slices_of_a_kidney(ct, of_segments, slices, z):
 
 @pytest.mark.parametrize("lacking", ["kidney", "tumour"])
 def test_missing_slices_thinner_than_pixels(tmp_path, of_segments, lacking):
-    """A CT of thin slices, 3 mm with pixels of 4 mm (0.6 and 0.8 in the field): its slices lack just so, and are named."""
+    """A CT of thin slices, 3 mm with pixels of 4 mm (0.6 and 0.8 in the field): its slices lack just so,
+    and are named.
+    """
     image = scan((4.0, 4.0, 3.0))
     path = written(tmp_path / "ct.nrrd", image)
     slices = {name: [31] if name == lacking else [] for name in ("kidney", "tumour")}
@@ -637,7 +663,9 @@ def test_missing_slices_thinner_than_pixels(tmp_path, of_segments, lacking):
 
 @pytest.mark.parametrize("direction", ["identity", "left-handed"])
 def test_a_tumour_beside_missing_slices(ct, of_segments, direction):
-    """Two slices of the kidney are missing below the tumour's end: it does not grow into them, in either order of slices."""
+    """Two slices of the kidney are missing below the tumour's end: it does not grow into them, in either
+    order of slices.
+    """
     image = scan(direction=DIRECTIONS[direction])
     heights = points_of(image)[:, 0, 0, 2]
     missing = np.flatnonzero(np.isin(heights, (4.0, 8.0)))
@@ -655,7 +683,9 @@ def test_many_missing_slices_bridged_by_a_cyst(ct, of_segments):
 
 
 def test_a_missing_slice_in_a_file_that_is_cropped(ct, tmp_path):
-    """Files of a folder are cropped when they are read: the slice is named by its place, which the user's viewer shows too."""
+    """Files of a folder are cropped when they are read: the slice is named by its place, which the user's
+    viewer shows too.
+    """
     image, path = ct
     folder = tmp_path / "segmentations"
     folder.mkdir()
@@ -674,7 +704,9 @@ def test_a_slice_missing_in_both_kidneys(ct, of_segments):
 
 
 def test_every_fifth_slice(tmp_path, of_segments):
-    """Nobody filled between slices: what is missing is interpolated and named, or refused as missing, not as a wrong side."""
+    """Nobody filled between slices: what is missing is interpolated and named, or refused as missing, not
+    as a wrong side.
+    """
     image = scan((4.0, 4.0, 2.5))
     mask = without(image, LEFT, [k for k in range(63) if k % 5])
     path = written(tmp_path / "ct.nrrd", image)
@@ -686,7 +718,9 @@ def test_every_fifth_slice(tmp_path, of_segments):
 
 @pytest.mark.parametrize("touching_mm", [1.5, 3.0])
 def test_a_tumour_that_hardly_touches(tmp_path, of_segments, touching_mm):
-    """Fat between an exophytic tumour and the kidney is no missing slice: none of it becomes kidney, and nothing warns."""
+    """Fat between an exophytic tumour and the kidney is no missing slice: none of it becomes kidney, and
+    nothing warns.
+    """
     tumour = np.array([113.0 - touching_mm, 35.0, 12.0]), np.full(3, 18.0)
     image = scan((3.0, 3.0, 3.0), ((-100, BODY), (110, LIVER), *KIDNEYS, (70, tumour)))
     union = inside(image, LEFT) | inside(image, tumour)
@@ -769,7 +803,9 @@ def folder_of_files(tmp_path_factory):
 
 @pytest.mark.parametrize("text", PRIVATE)
 def test_no_file_names_the_patient(folder_of_files, text):
-    """Names of regions with the patient's name, date of birth or ID, also where they are words or numbers of structures."""
+    """Names of regions with the patient's name, date of birth or ID, also where they are words or numbers
+    of structures.
+    """
     assert len(list(folder_of_files.iterdir())) == 8
     assert not [file.name for file in folder_of_files.iterdir() if text.encode() in file.read_bytes()]
 

@@ -35,7 +35,9 @@ def affine(spacing, turn=None, origin=(-30.0, 12.0, 7.0)) -> np.ndarray:
 
 
 def centres(spacing, factors=(1, 1, 1), extent_mm=60.0) -> np.ndarray:
-    """Centres (nx, ny, nz, 3) [mm] of a grid of a spacing, divided, whose first coarse voxel has its centre at 0."""
+    """Centres (nx, ny, nz, 3) [mm] of a grid of a spacing, divided, whose first coarse voxel has its
+    centre at 0.
+    """
     spacing, factors = np.array(spacing), np.array(factors)
     count = np.ceil(extent_mm / spacing).astype(int) * factors
     return ((np.moveaxis(np.indices(count), 0, -1) + 0.5) / factors - 0.5) * spacing
@@ -61,7 +63,9 @@ def test_voxels_are_divided_into_as_few_as_are_short_enough(spacing):
 
 
 def test_a_place_keeps_its_hu_on_the_finer_grid():
-    """Of HU that change linearly along all axes of oblique voxels, each finer voxel has those of its place."""
+    """Of HU that change linearly along all axes of oblique voxels, each finer voxel has those of its
+    place.
+    """
     spacing, shape, turn = (0.9, 2.5, 5.0), (9, 7, 6), rotation_about([1, 2, 3], 40)
     factors, to_index = fine_factors(np.array(spacing)), affine(spacing, turn)
     slope, base = np.array([3.0, -2.0, 1.5]), 40.0
@@ -117,15 +121,16 @@ def test_labels_of_thick_slices_keep_their_volume_and_their_border_without_a_sta
     wrong, wrong_of_stair = fine != (away < 0), stair != (away < 0)
     # One piece without holes.
     assert ndimage.label(fine)[1] == 1 and ndimage.label(~fine)[1] == ndimage.label(away >= 0)[1]
-    # A chord between slices is inside a convex body, by its sagitta: for the ball 5^2 / (8 * 18), for the cylinder, which the slices cut in
-    # ellipses, as much over 8 mm; and half of the longest side of a fine voxel on average not at all.
+    # A chord between slices is inside a convex body, by its sagitta: for the ball 5^2 / (8 * 18), for the
+    # cylinder, which the slices cut in ellipses, as much over 8 mm; and half of the longest side of a fine
+    # voxel on average not at all.
     radius = 18.0 if solid is ball else 8.0
     sagitta = max(spacing) ** 2 / 8 / radius
     lost = (2 if solid is cylinder else 3) * sagitta / radius
     share = fine.sum() / (away < 0).sum()
     assert 1 - lost - 0.01 < share < 1.01
-    # Fewer voxels are on the wrong side than of the stair, and none farther than half of a slice. Of slices of 3 mm, in halves, the border
-    # moves by less than a voxel.
+    # Fewer voxels are on the wrong side than of the stair, and none farther than half of a slice. Of slices
+    # of 3 mm, in halves, the border moves by less than a voxel.
     assert wrong.sum() < (0.75 if max(spacing) > 4 else 1.0) * wrong_of_stair.sum()
     assert np.abs(away[wrong]).max() < max(spacing) / 2
 
@@ -176,7 +181,8 @@ def test_distances_from_a_surface_are_those_of_its_place_in_any_grid(turn):
     index = np.moveaxis(np.indices(shape), 0, -1)[box]
     away = np.linalg.norm((index - to_index[:3, 3]) @ np.linalg.inv(to_index[:3, :3]).T, axis=-1) - 18.0
     near = np.abs(away) < 5.0
-    # Facets are up to 0.07 mm inside the ball; a chord of the distance over the grid's diagonal is 3 SURFACE_MM^2 / (8 * 13) off.
+    # Facets are up to 0.07 mm inside the ball; a chord of the distance over the grid's diagonal is 3
+    # SURFACE_MM^2 / (8 * 13) off.
     assert np.abs(found - away)[near].max() < 0.07 + 3 * SURFACE_MM**2 / (8 * 13) + 0.02
     # All of the ball and its margin is in the box.
     whole = np.moveaxis(np.indices(shape), 0, -1)
@@ -186,12 +192,15 @@ def test_distances_from_a_surface_are_those_of_its_place_in_any_grid(turn):
 
 @pytest.mark.parametrize("spacing", [(0.8, 0.5, 1.0), (0.66, 1.0, 0.45)])
 def test_depth_by_cells_is_in_place(spacing):
-    """Below the surface of a ball, of which each of its voxels knows its depth; cells have two to four voxels along an axis."""
+    """Below the surface of a ball, of which each of its voxels knows its depth; cells have two to four
+    voxels along an axis.
+    """
     places = centres(spacing, extent_mm=59.0)
     depth = coarse_distance(ball(places) < 0, np.array(spacing))
     away = depth + ball(places)
     inside = ball(places) < -1
-    # From centre to centre of cells it is up to half a cell more than from the surface; that is found to half a cell's diagonal.
+    # From centre to centre of cells it is up to half a cell more than from the surface; that is found to half
+    # a cell's diagonal.
     assert np.abs(away[inside]).max() < 2.1 * (1 + np.sqrt(3)) / 2
     assert 0 < away[inside].mean() < 2.1 / 2
     assert places[depth >= 5].mean(axis=0) == pytest.approx(MIDDLE, abs=0.1)

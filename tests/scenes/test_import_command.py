@@ -261,7 +261,8 @@ def test_a_value_that_no_voxel_has_is_noted(hospital, taken_in, tmp_path, monkey
     ("kept", "often", "note"),
     [
         ([0, 1, 2, 3, 4], 2, "region 1: contours that stand twice in a plane, counted once: 5"),
-        ([0, 1, 3, 4], 1, "region 1: slices without a contour, interpolated between their neighbours, at z 12.5 mm"),
+        ([0, 1, 3, 4], 1, "region 1: slices without a contour, interpolated between their neighbours, at z "
+            "12.5 mm"),
     ],
 )  # fmt: skip
 def test_what_was_mended_in_contours_is_noted(hospital, taken_in, tmp_path, monkeypatch, kept, often, note):
@@ -317,7 +318,8 @@ class TestProbeAndStiffness:
     @pytest.mark.parametrize(
         ("name", "words"),
         [
-            ("dropin", "--probe: 'dropin' is no file, and known by name are curvilinear, drop-in, linear, phased"),
+            ("dropin", "--probe: 'dropin' is no file, and known by name are curvilinear, drop-in, linear, "
+            "phased"),
             ("none.toml", "--probe: 'none.toml' is no file"),
             ("bad.toml", "TransducerWidthMm"),
         ],

@@ -1,4 +1,6 @@
-"""The findings of an import in the patient's folder, and the warnings that stay until they are acknowledged."""
+"""The findings of an import in the patient's folder, and the warnings that stay until they are
+acknowledged.
+"""
 
 import json
 

@@ -1,4 +1,6 @@
-"""Whatever the orientation, the voxels and the file: the surface lies where the label is, and left stays left."""
+"""Whatever the orientation, the voxels and the file: the surface lies where the label is, and left stays
+left.
+"""
 
 import nibabel
 import numpy as np

@@ -1,4 +1,6 @@
-"""DICOM-SEG as writers in the field make it: numbered from 0, or without what a reader of voxels does not need."""
+"""DICOM-SEG as writers in the field make it: numbered from 0, or without what a reader of voxels does not
+need.
+"""
 
 import numpy as np
 import pydicom

@@ -86,7 +86,8 @@ def test_without_a_labelled_sinus_the_concavity_is_the_hilum(bitten):
     assert axes.estimated and axes.polar_lines == axes.sinus_lines
     assert angle_deg(axes.hilar, MEDIAL) < 5
     low, high = opening_ends(*SINUS)
-    # The mouth is where the contour is half as far from the parenchyma as in its middle: within the lips, over most of their distance.
+    # The mouth is where the contour is half as far from the parenchyma as in its middle: within the lips,
+    # over most of their distance.
     assert low - 1 < axes.polar_lines[0] and axes.polar_lines[1] < high + 1
     assert np.diff(axes.polar_lines)[0] > 0.4 * (high - low)
     assert np.mean(axes.polar_lines) == pytest.approx((low + high) / 2, abs=2.0)
@@ -108,7 +109,9 @@ def test_a_vessel_elsewhere_does_not_move_the_hilum(plain, height):
 
 
 def test_the_embedded_patient():
-    """The kidney was drawn along these axes; where its sinus is not labelled, the concavity shows nearly the same lines."""
+    """The kidney was drawn along these axes; where its sinus is not labelled, the concavity shows nearly
+    the same lines.
+    """
     scene = load_scene(EMBEDDED)
     anatomy = load_anatomy(scene, EMBEDDED.parent)
     axes = kidney_axes(anatomy.organ, [anatomy.tumour], anatomy.parts)

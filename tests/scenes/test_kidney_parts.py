@@ -26,7 +26,9 @@ DEPTH = ndimage.distance_transform_edt(KIDNEY, sampling=SPACING)
 
 
 def pyramids() -> np.ndarray:
-    """Pyramids in three rows of five around the sinus, 7 mm below the surface, with 4 mm of cortex between them; a fifth of the parenchyma."""
+    """Pyramids in three rows of five around the sinus, 7 mm below the surface, with 4 mm of cortex between
+    them; a fifth of the parenchyma.
+    """
     column = np.abs((AT[..., 2] + 9.0) % 18.0 - 9.0) > 7.0
     angle = np.arctan2(AT[..., 1], AT[..., 0])
     across = np.hypot(AT[..., 0], AT[..., 1]) * np.abs((angle + np.pi / 5) % (2 * np.pi / 5) - np.pi / 5)
@@ -57,7 +59,8 @@ def dice(one: np.ndarray, other: np.ndarray) -> float:
 @pytest.mark.parametrize("cortex_hu, medulla_hu", [(190.0, 90.0), (160.0, 100.0), (230.0, 80.0)])
 def test_cortex_and_medulla_are_told_apart_in_the_corticomedullary_phase(cortex_hu, medulla_hu):
     parts = parts_of(made(medulla_hu, 8.0, cortex_hu))
-    # Pyramids 14 mm wide and 9 mm high, whose borders are right to half a voxel on each side: (1 - 1 / 14)^2 (1 - 1 / 9) of their volume.
+    # Pyramids 14 mm wide and 9 mm high, whose borders are right to half a voxel on each side: (1 - 1 / 14)^2
+    # (1 - 1 / 9) of their volume.
     assert dice(parts["medulla"], MEDULLA) > 0.85
     assert dice(parts["cortex"], PARENCHYMA & ~MEDULLA) > 0.95
     assert "kidney" not in parts

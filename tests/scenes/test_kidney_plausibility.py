@@ -31,7 +31,9 @@ KIDNEY = ellipsoid(CENTRE, AXES)
 
 
 def labelled(*solids, spacing=(2.5, 2.5, 2.5), direction="identity", low=(-5, -40, -75), high=(115, 80, 75)):
-    """A label map with solids (value, inside) painted one over the other, and its organ; it covers an LPS box [mm]."""
+    """A label map with solids (value, inside) painted one over the other, and its organ; it covers an LPS
+    box [mm].
+    """
     grid = VoxelGrid.of(grid_around(low, high, spacing, DIRECTIONS[direction]))
     places = points_of(grid.image(np.zeros(grid.size[::-1], np.uint8)))
     values = np.zeros(grid.size[::-1], np.uint8)

@@ -25,7 +25,8 @@ def region(beside_hu, cut=None):
 def test_an_edge_is_a_change_by_a_share_of_the_contrast_to_fat(sign):
     assert region(KIDNEY_HU + sign * 1.01 * EDGE_SHARE * CONTRAST).edge == 1
     touching = region(KIDNEY_HU + sign * 0.99 * EDGE_SHARE * CONTRAST)
-    # One of six sides, 16 x 12 of 1056 voxel faces, and where its shell is rounded some more of its neighbours'.
+    # One of six sides, 16 x 12 of 1056 voxel faces, and where its shell is rounded some more of its
+    # neighbours'.
     assert 192 / 1056 <= 1 - touching.edge < 1.5 * 192 / 1056
     assert touching.edge < LEAST_EDGE and not touching.is_kidney
     x, y, z = touching.open_side

@@ -127,7 +127,9 @@ class TestSegmentations:
 class TestContours:
     @pytest.mark.parametrize(("planes", "filled"), [((1, 2, 4), (1, 2, 3, 4)), ((0, 1, 2, 5), (0, 1, 2, 5))])
     def test_a_plane_left_out(self, tmp_path, planes, filled):
-        """Planes stay where they were drawn; one without a contour is interpolated, more of them between two ends are not."""
+        """Planes stay where they were drawn; one without a contour is interpolated, more of them between
+        two ends are not.
+        """
         series = Series(tmp_path / "ct")
         rings = [ring(series.places(k)[5, 6], 2.6, series.direction) for k in planes]
         path = write_structures(tmp_path / "rt.dcm", {"Kidney": rings})

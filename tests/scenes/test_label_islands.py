@@ -1,4 +1,6 @@
-"""What is labelled and connected to no kidney is named; islands of the other kidney are none of this patient's."""
+"""What is labelled and connected to no kidney is named; islands of the other kidney are none of this
+patient's.
+"""
 
 import re
 
@@ -34,9 +36,13 @@ def test_an_island_is_named_with_volume_and_place(monkeypatch, name, value, ml, 
     lines = warnings_of(ct, image, "left")
     assert len(lines) == is_named
     if is_named:
-        found = rf"([\d.]+) ml of the {name}'s label touch no labelled kidney, (\d+) mm from this one at 70, 35, 7"
+        found = (
+            rf"([\d.]+) ml of the {name}'s label touch no labelled kidney, (\d+) mm from this one at 70, "
+            r"35, 7"
+        )
         volume, gap = map(float, re.match(found, lines[0]).groups())
-        # Of voxels of 0.025 ml at the surface half are in it, at random; each body ends up to a slice before its surface.
+        # Of voxels of 0.025 ml at the surface half are in it, at random; each body ends up to a slice before
+        # its surface.
         assert volume == pytest.approx(ml, abs=0.05 + 0.025 * 2 * np.sqrt(4 * np.pi * radius**2 / 2.5**2 / 4))
         assert 64 - 45 - radius - 0.5 <= gap <= 64 - 45 - radius + 2 * 4.0
     assert warnings_of(ct, image, "right") == []

@@ -1,4 +1,6 @@
-"""Regions of structure sets and segments of segmentations: which are read, how far, and from any transfer syntax."""
+"""Regions of structure sets and segments of segmentations: which are read, how far, and from any transfer
+syntax.
+"""
 
 import numpy as np
 import pydicom
@@ -25,11 +27,14 @@ from scenes.patients.readers.label_maps import NEAR_MM
 from scenes.patients.readers.segment_names import is_needless, is_public
 
 NEEDLESS = [
-    "BODY", "Body", "External", "external_1", "Skin", "Patient", "Patient outline", "Outer Contour", "Body contour", "whole body",
-    "CouchSurface", "CouchInterior", "Z_Couch", "Table", "table top", "Mattress", "heart", "lung_left", "femur_right",
+    "BODY", "Body", "External", "external_1", "Skin", "Patient", "Patient "
+            "outline", "Outer Contour", "Body contour", "whole body",
+    "CouchSurface", "CouchInterior", "Z_Couch", "Table", "table "
+            "top", "Mattress", "heart", "lung_left", "femur_right",
 ]  # fmt: skip
 NEEDED = [
-    "kidney_left", "GTV", "vertebral body L1", "external oblique muscle", "body of pancreas", "spleen", "Segment_1", "skin metastasis",
+    "kidney_left", "GTV", "vertebral body "
+            "L1", "external oblique muscle", "body of pancreas", "spleen", "Segment_1", "skin metastasis",
     "stable lesion", "unknown", "aorta", "patient's cyst",
 ]  # fmt: skip
 
@@ -41,7 +46,10 @@ def test_needless_names():
 
 def test_names_of_structures_alone():
     """They identify nobody."""
-    of_structures = "adrenal_gland_left|Niere links|vertebrae_L2|kidneyL|Kidney 2|BODY|left|Segment_1|portal_vein_and_splenic_vein|"
+    of_structures = (
+        "adrenal_gland_left|Niere links|vertebrae_L2|kidneyL|Kidney "
+        "2|BODY|left|Segment_1|portal_vein_and_splenic_vein|"
+    )
     assert [name for name in of_structures.split("|") if not is_public(name)] == []
     of_persons = "Doe|kidney Doe|Doe_left|kidney 19600229|Mr L"
     assert [name for name in of_persons.split("|") if is_public(name)] == []
@@ -125,7 +133,9 @@ class TestStructures:
 
     @pytest.mark.parametrize("direction", ["identity", "oblique", "slices first"])
     def test_others_are_filled_near_the_kidneys(self, tmp_path, direction):
-        """A long, wide region beside a small kidney; the box of the kidney's points in the patient, and the voxels that cover it."""
+        """A long, wide region beside a small kidney; the box of the kidney's points in the patient, and
+        the voxels that cover it.
+        """
         turned = DIRECTIONS[direction]
         series = Series(tmp_path, turned, size=(60, 60, 60), gap=5.0, origin=turned @ np.full(3, -147.5))
         series.spacing = (5.0, 5.0)
@@ -158,7 +168,9 @@ class TestStructures:
 
     @pytest.mark.parametrize("corners", [3, 4, 60, 500])
     def test_any_polygon(self, tmp_path, corners):
-        """As skimage fills it, also where it crosses itself and has corners and edges on pixels; of oblique ones skimage misses some."""
+        """As skimage fills it, also where it crosses itself and has corners and edges on pixels; of
+        oblique ones skimage misses some.
+        """
         series = Series(tmp_path / "ct", DIRECTIONS["identity"], size=(70, 60, 4), origin=(0, 0, 0))
         series.spacing = (1.0, 1.0)
         drawn = np.random.default_rng(corners).integers(-8, 75, (3, corners, 2))

@@ -1,4 +1,6 @@
-"""Labels that are shifted against their CT: a synthetic body, and real CTs with labels where they are there."""
+"""Labels that are shifted against their CT: a synthetic body, and real CTs with labels where they are
+there.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -65,7 +67,8 @@ def test_the_way_back_is_stated(ct_and_organ, shift, words):
     assert words in line and " and " not in line.split(";")[0]
 
 
-# Enhanced and not, beside tissue as bright and brighter than the kidney, noisy, in thick slices, along any axes.
+# Enhanced and not, beside tissue as bright and brighter than the kidney, noisy, in thick slices, along any
+# axes.
 @pytest.mark.parametrize(
     "how",
     [
@@ -119,7 +122,9 @@ def test_no_shift_is_stated_where_the_fit_is_beyond_reach(ct_and_organ, shift):
 
 @pytest.mark.parametrize("side", [0, 1, 2])
 def test_the_share_of_fat_is_that_of_a_shell_of_4_mm(side):
-    """A cuboid of 32 x 40 x 48 mm has 30.7 ml within 4 mm of its faces; with 3 or 4 mm of fat on one side of it."""
+    """A cuboid of 32 x 40 x 48 mm has 30.7 ml within 4 mm of its faces; with 3 or 4 mm of fat on one side
+    of it.
+    """
     spacing, size_mm = np.array([1.0, 2.0, 4.0]), np.array([32.0, 40.0, 48.0])
     count = np.rint(size_mm / spacing).astype(int)
     organ = np.pad(np.ones(count[::-1], bool), 3)

@@ -106,7 +106,9 @@ def test_the_embedded_patient_with_a_stiff_tumour(device):
 
 
 def test_a_rehearsal_begins_with_tissue_that_has_relaxed(device):
-    """Its rest under its own weight is that of the same tissue without relaxation, however slowly it relaxes."""
+    """Its rest under its own weight is that of the same tissue without relaxation, however slowly it
+    relaxes.
+    """
     scene = briefly(200)
     slow = dict(prony=(Prony(modulus_ratio=2.0, time_s=1000.0),), cell_mm=4.0)
     strains = []

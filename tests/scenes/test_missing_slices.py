@@ -1,4 +1,6 @@
-"""A slice that nobody segmented is named and filled, bridged by the tumour or not; what is anatomy stays as it is."""
+"""A slice that nobody segmented is named and filled, bridged by the tumour or not; what is anatomy stays
+as it is.
+"""
 
 import re
 from pathlib import Path
@@ -84,7 +86,9 @@ class TestFilled:
 
     @pytest.mark.parametrize("is_first", [True, False])
     def test_what_is_labelled_on_one_side_alone_is_the_tissue_between(self, is_first):
-        """Cortex below, medulla above, and a narrower section on one side: in its rim the slice between has the other side's value."""
+        """Cortex below, medulla above, and a narrower section on one side: in its rim the slice between
+        has the other side's value.
+        """
         voxels = np.zeros((9, 40, 40), np.uint8)
         voxels[:4, 4:36, 4:36], voxels[5:, 4:36, 4:36] = 1, 2
         narrow = np.s_[3 if is_first else 5]
@@ -125,7 +129,9 @@ class TestFilled:
         [("slices first", 0, (5.0, 2.0, 3.0)), ("oblique", 2, (2.0, 3.0, 5.0))],
     )
     def test_the_place_in_a_turned_label(self, direction, axis, spacing):
-        """A plane across n at a distance d from an ellipsoid's middle cuts an ellipse about d A n / n'A n, where A has the squares of its axes."""
+        """A plane across n at a distance d from an ellipsoid's middle cuts an ellipse about d A n / n'A n,
+        where A has the squares of its axes.
+        """
         empty = grid_around((20, -10, -50), (130, 80, 80), spacing, DIRECTIONS[direction])
         labels, grid = drawn(empty, (2, LEFT)), VoxelGrid.of(empty)
         k = int(np.rint(grid.index(LEFT[0] + [0, 0, 18.0]))[axis])
@@ -159,7 +165,9 @@ class TestLeft:
 
     @pytest.mark.parametrize(("width", "count"), [(3, 0), (6, 1)])
     def test_the_end_of_a_lobe(self, width, count):
-        """A section of less than 1 cm2: 5 rows of 3 pixels of 4 mm2, in slices of 5 mm; twice as wide it is missing."""
+        """A section of less than 1 cm2: 5 rows of 3 pixels of 4 mm2, in slices of 5 mm; twice as wide it
+        is missing.
+        """
         values = np.zeros((20, 20, 20), np.uint8)
         values[:, 5:10, 5 : 5 + width], values[10] = 2, 0
         grid = VoxelGrid((20, 20, 20), np.array([2.0, 2.0, 5.0]), np.zeros(3), np.eye(3))

@@ -142,7 +142,8 @@ def test_involvement(tissue, name, distance, points):
     [
         # 3 cm, exophytic, anterior at the upper pole: 1 + 1 + 1 + 1, and 1 + 1 + 1 + 1 + 1 + 1.
         (dict(centre=(5.0, -12.0, 45.0)), "4a, low", "6a, low"),
-        # 5 cm, 30 % exophytic, 5 mm from the sinus, posterior, across a polar line: 2 + 2 + 2 + 2, and 1 + 2 + 1 + 1 + 1 + 2.
+        # 5 cm, 30 % exophytic, 5 mm from the sinus, posterior, across a polar line: 2 + 2 + 2 + 2, and 1 + 2
+        # + 1 + 1 + 1 + 2.
         (
             dict(
                 centre=(5.0, 12.0, 32.0),
@@ -175,7 +176,9 @@ def test_whole_cases(case, renal, padua):
 
 
 def test_classes_begin_and_end_at_the_totals_of_the_papers():
-    """R.E.N.A.L. 4 to 6, 7 to 9, 10 to 12 (Kutikov and Uzzo 2009); PADUA 6 and 7, 8 and 9, 10 to 14 (Ficarra et al. 2009)."""
+    """R.E.N.A.L. 4 to 6, 7 to 9, 10 to 12 (Kutikov and Uzzo 2009); PADUA 6 and 7, 8 and 9, 10 to 14
+    (Ficarra et al. 2009).
+    """
 
     def classes(score, totals):
         components = [(Component("all", (total,), None, "mm"),) for total in totals]
@@ -194,7 +197,8 @@ def test_a_total_that_is_not_certain_is_a_range():
     assert (str(padua), padua.complexity) == ("6 to 10", "low to high")
     text = dict(Complexity(found, renal, padua).rows())
     assert text["not known"] == (
-        "N, L, location, rim, renal sinus, collecting system, a/p, h; label the collecting system, renal sinus, renal artery and vein"
+        "N, L, location, rim, renal sinus, collecting system, a/p, h; label the collecting system, renal "
+        "sinus, renal artery and vein"
     )
     assert "estimated" not in text and "distance" not in text
 
@@ -245,7 +249,9 @@ def test_a_mirrored_kidney_has_the_same_scores():
 
 
 def test_the_embedded_patient():
-    """A tumour drawn as a ball of 12.4 mm with lobes, in the anterior lower half (``TUMOUR_SITE``), 2.5 mm under the surface."""
+    """A tumour drawn as a ball of 12.4 mm with lobes, in the anterior lower half (``TUMOUR_SITE``), 2.5 mm
+    under the surface.
+    """
     scene = load_scene(EMBEDDED)
     found = complexity(load_anatomy(scene, EMBEDDED.parent), scene.attachment.at_mm)
     assert 24.8 < found.tumour.diameter_mm < 30 and 0.33 < found.tumour.exophytic_share < 0.45

@@ -1,4 +1,6 @@
-"""Where the probe of an imported patient starts: over the middle of the tumour, or of the kidney, from where it can be reached."""
+"""Where the probe of an imported patient starts: over the middle of the tumour, or of the kidney, from
+where it can be reached.
+"""
 
 import tomllib
 
@@ -100,7 +102,9 @@ def test_without_a_tumour_it_is_over_the_middle_on_the_flat_side(smooth):
 
 
 def test_it_is_not_in_a_concavity():
-    """The nearest surface is that of a hilum that opens to the front, where vessels leave and no instrument has room."""
+    """The nearest surface is that of a hilum that opens to the front, where vessels leave and no
+    instrument has room.
+    """
     organ, tumour = kidney(bite=BITE), ball((-8.0, -6.0, 0.0), 6.0)
     press = opening_press(organ, tumour, slab(), SUPINE, HOUSING_MM)
     assert depth_below_hull(organ, face_of(press, organ)[None])[0] < 3.0

@@ -36,7 +36,9 @@ class TestOrgan:
         "right_x, left_x, is_told", [(-45.0, 30.0, True), (20.0, 90.0, True), (1.0, 55.0, False)]
     )
     def test_without_a_body_two_kidneys_are_told_apart_by_their_distance(self, right_x, left_x, is_told):
-        """Farther than 60 mm they are two, with the midline between them; closer ones may be pieces of one."""
+        """Farther than 60 mm they are two, with the midline between them; closer ones may be pieces of
+        one.
+        """
         empty = grid_around((-80, -30, -60), (130, 90, 80), (4.0, 4.0, 4.0))
         axes = np.array([14.0, 20.0, 40.0])
         both = [(np.array([x, 30.0, 0.0]), axes) for x in (right_x, left_x)]

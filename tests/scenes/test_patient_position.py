@@ -30,7 +30,8 @@ from scenes.patients.readers.label_maps import LabelMap
 from scenes.volumes.lazy_volume import LazyVolume
 
 TERMS = {"S": "supine", "P": "prone", "DL": "left-decubitus", "DR": "right-decubitus"}
-# Of the position after so many quarter turns of a picture, from its row axis (posterior) to its column axis (left).
+# Of the position after so many quarter turns of a picture, from its row axis (posterior) to its column axis
+# (left).
 TURNS = ("supine", "left-decubitus", "prone", "right-decubitus")
 
 
@@ -87,7 +88,9 @@ class TestHeader:
 
 @pytest.mark.parametrize("position", ["prone", "left-decubitus"])
 def test_gravity_is_that_of_the_ct(monkeypatch, position):
-    """Support, scene and words follow it; the patient's axes do not, so that bones behind are as they should be."""
+    """Support, scene and words follow it; the patient's axes do not, so that bones behind are as they
+    should be.
+    """
     coarsely(monkeypatch)
     used = {}
     monkeypatch.setattr(
@@ -136,7 +139,9 @@ def test_the_option_has_four_words_and_reaches_the_import(tmp_path, capfd, monke
 
 
 class Trunk:
-    """Axial slices of a supine body, 300 x 200 mm, on the grid of the search: rows go to the back, columns to the left."""
+    """Axial slices of a supine body, 300 x 200 mm, on the grid of the search: rows go to the back, columns
+    to the left.
+    """
 
     def __init__(self) -> None:
         self.y, self.x = np.mgrid[-80:80, -80:80] * GRID_MM[0]
@@ -150,7 +155,9 @@ class Trunk:
         return self
 
     def with_level(self, gas_side: float = -1.0):
-        """A loop of bowel, half of it gas, one HU thinner than lung may be: the half in front, or with 1 that behind."""
+        """A loop of bowel, half of it gas, one HU thinner than lung may be: the half in front, or with 1
+        that behind.
+        """
         self.slice[(np.hypot(self.x, self.y + 40) < 30) & (gas_side * (self.y + 40) > 0)] = -901
         return self
 

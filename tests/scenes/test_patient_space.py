@@ -1,4 +1,6 @@
-"""Files that do not say where their axes point are refused, as left and right may be exchanged; the user may say it."""
+"""Files that do not say where their axes point are refused, as left and right may be exchanged; the user
+may say it.
+"""
 
 import gzip
 from pathlib import Path

@@ -64,7 +64,10 @@ PARTS = {
 
 
 def test_it_is_the_patient_of_the_documents(phantom, labels, hu):
-    """Figures of the documents were measured on it: who changes it measures them anew. A few voxels are rounding."""
+    """Figures of the documents were measured on it: who changes it measures them anew.
+
+    A few voxels are rounding.
+    """
     for label, (count, place) in PARTS.items():
         own = labels == label
         assert own.sum() == pytest.approx(count, abs=4), label

@@ -41,7 +41,9 @@ def in_any_encoding(text: str) -> set[bytes]:
 
 
 def from_dicom(folder: Path) -> list[Path]:
-    """A series and a structure set whose elements, private ones, paths and names of regions all name the patient."""
+    """A series and a structure set whose elements, private ones, paths and names of regions all name the
+    patient.
+    """
 
     def hounsfield(places):
         found = np.where(level(places, (np.zeros(3), np.array([160.0, 110.0, 400.0]))) < 0, 40.0, -1000.0)
@@ -128,8 +130,10 @@ def test_a_name_that_may_be_a_persons_is_shown_in_the_terminal_alone(tmp_path, c
 @pytest.mark.parametrize(
     ("name", "is_written"),
     [
-        ("kidney_left", True), ("Renal mass 2", True), ("BODY", True), ("vertebrae_L1", True), ("GTV_PRV5", True),
-        ("Doe_left", False), ("GTV Doe", False), ("kidney 19600229", False), ("Carter kidney", False), ("Harnisch", False),
+        ("kidney_left", True), ("Renal mass "
+            "2", True), ("BODY", True), ("vertebrae_L1", True), ("GTV_PRV5", True),
+        ("Doe_left", False), ("GTV "
+            "Doe", False), ("kidney 19600229", False), ("Carter kidney", False), ("Harnisch", False),
     ],
 )  # fmt: skip
 def test_names_of_structures_alone_are_written(name, is_written):

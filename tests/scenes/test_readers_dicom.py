@@ -1,4 +1,6 @@
-"""CT series as DICOM: any order, orientation and container; missing, duplicate and tilted slices and other images are reported."""
+"""CT series as DICOM: any order, orientation and container; missing, duplicate and tilted slices and other
+images are reported.
+"""
 
 import shutil
 
@@ -217,7 +219,9 @@ class TestChoice:
 
 class TestGeometry:
     def test_tilted_gantry(self, tmp_path):
-        """In its slices' planes linear interpolation errs by h^2 f''/8; the file and the result round by 1/2 HU each."""
+        """In its slices' planes linear interpolation errs by h^2 f''/8; the file and the result round by
+        1/2 HU each.
+        """
         tilted = Rotation.from_euler("x", TILT, degrees=True).as_matrix()
         start = np.array([-31.5, 20.25, -400.0])
         series = Series(

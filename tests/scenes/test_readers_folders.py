@@ -1,4 +1,6 @@
-"""A folder with volume files as CT: the one that is no label map, beside DICOM none of them, and of several none."""
+"""A folder with volume files as CT: the one that is no label map, beside DICOM none of them, and of
+several none.
+"""
 
 import numpy as np
 import pytest
@@ -52,8 +54,10 @@ def test_the_one_that_is_not_named_as_labels(tmp_path, names):
 @pytest.mark.parametrize(
     ("names", "words"),
     [
-        (["arterial.nii.gz", "venous.nrrd"], "has 2 files that may be the CT: arterial.nii.gz, venous.nrrd; expected one"),
-        (["a.nii.gz", "b/c.mha", "seg.nrrd"], "has 2 files that may be the CT: a.nii.gz, b/c.mha; expected one; give its path"),
+        (["arterial.nii.gz", "venous.nrrd"], "has 2 files that may be the CT: arterial.nii.gz, venous.nrrd; "
+            "expected one"),
+        (["a.nii.gz", "b/c.mha", "seg.nrrd"], "has 2 files that may be the CT: a.nii.gz, b/c.mha; expected "
+            "one; give its path"),
         (["kidney.nii.gz", "labels.nrrd"], "has 2 files that may be the CT, all named as labels: kidney"),
     ],
 )  # fmt: skip

@@ -1,4 +1,6 @@
-"""Damaged and hostile files: refused in one line, in bounded memory, with nothing written and nothing read elsewhere."""
+"""Damaged and hostile files: refused in one line, in bounded memory, with nothing written and nothing read
+elsewhere.
+"""
 
 import gzip
 import resource
@@ -72,7 +74,9 @@ def replaced(path, old, new):
 
 
 def inflating(file, honest=True):
-    """A deflated file whose pixels are 320 MiB of zeros; a dishonest one says that its meta header is longer."""
+    """A deflated file whose pixels are 320 MiB of zeros; a dishonest one says that its meta header is
+    longer.
+    """
     content = bytearray(file.read_bytes())
     meta = 144 + struct.unpack_from("<I", content, 140)[0]
     if not honest:
@@ -244,9 +248,12 @@ class TestFiles:
         [
             "ElementDataFile = ../x.raw", "ElementDataFile = {outside}/x.raw", "ElementDataFile: ../x.raw",
             "Comment = a\x85ElementDataFile = LOCAL\nElementDataFile = ../x.raw",
-            "Comment = a\rElementDataFile = LOCAL\nElementDataFile = ../x.raw", "\n\nElementDataFile = ../x.raw",
-            "{long}ElementDataFile = ../x.raw", "ElementDataFile = LIST\n../x.raw", "ElementDataFile = x%d.raw 1 6 1",
-            "BinaryData = True ElementDataFile = ../x.raw", "ElementDataFile = a\0b", "ElementDataFile = {name}", "ElementDataFile = link.raw",
+            "Comment = a\rElementDataFile = LOCAL\nElementDataFile = "
+            "../x.raw", "\n\nElementDataFile = ../x.raw",
+            "{long}ElementDataFile = "
+            "../x.raw", "ElementDataFile = LIST\n../x.raw", "ElementDataFile = x%d.raw 1 6 1",
+            "BinaryData = True ElementDataFile = "
+            "../x.raw", "ElementDataFile = a\0b", "ElementDataFile = {name}", "ElementDataFile = link.raw",
         ],
     )  # fmt: skip
     def test_voxels_of_metaimage_elsewhere(self, tmp_path, refused, ending, line):
@@ -260,7 +267,8 @@ class TestFiles:
     @pytest.mark.parametrize(
         "line",
         [
-            "data file: ../x.raw", "datafile: {outside}/x.raw", "Data File:../x.raw", "data file: LIST\n../x.raw",
+            "data file: "
+            "../x.raw", "datafile: {outside}/x.raw", "Data File:../x.raw", "data file: LIST\n../x.raw",
             "data file: ../x%d.raw 1 6 1", "# a\x85data file: in.raw\ndata file: ../x.raw",
             "# {name}\ndata file: ../x.raw", "data file: a\0b", "data file: link.raw",
         ],

@@ -29,10 +29,14 @@ NAMES = {
     "Niere links": ("kidney", "left"), "Niere rechts": ("kidney", "right"), "Rein gauche": ("kidney", "left"),
     "left renal mass": ("tumour", "left"), "GTV": ("tumour", None), "GTV_L": ("tumour", "left"),
     "Renal Tumor": ("tumour", None), "tumour": ("tumour", None), "ccRCC right": ("tumour", "right"),
-    "Tumor Niere links": ("tumour", "left"), "kidney_lesion": ("tumour", None), "kidney_cyst_left": ("cyst", "left"),
+    "Tumor Niere "
+    "links": ("tumour", "left"), "kidney_lesion": ("tumour", None), "kidney_cyst_left": ("cyst", "left"),
     "Renal cyst": ("cyst", None), "adrenal_gland_left": (None, "left"), "gallbladder": (None, None),
     "renal vein left": ("vein", "left"), "Renal artery R": ("artery", "right"), "aorta": ("artery", None),
-    "renal arteries and veins": ("vessel", None), "blood vessels": ("vessel", None), "inferior_vena_cava": ("vein", None), "ureter_right": ("urine", "right"), "Renal pelvis": ("urine", None),
+    "renal arteries and "
+    "veins": ("vessel", None), "blood "
+            "vessels": ("vessel", None), "inferior_vena_cava": ("vein", None), "ureter_right": ("urine", "right"), "Renal "
+            "pelvis": ("urine", None),
     "renal_cortex": ("cortex", None), "renal sinus fat": ("sinus", None), "liver": ("liver", None),
     "rib_left_11": ("bone", "left"), "vertebrae_L1": ("bone", None), "hip_left": ("bone", "left"),
     "spleen": ("spleen", None), "Segment_1": (None, None), "colon": (None, None), "iliopsoas_right": ("muscle", "right"),
@@ -162,7 +166,8 @@ class TestLabelMaps:
         ("voxels", "words"),
         [
             (np.full((4, 4, 4), 0.5, np.float32), "probability"), (np.zeros((4, 4, 4), np.uint8), "is empty"),
-            (np.full((4, 4, 4), -1000, np.int16), "exchanged"), (np.full((4, 4, 4), 70_000, np.int32), "whole numbers"),
+            (np.full((4, 4, 4), -1000, np.int16), "exchanged"), (np.full((4, 4, 4), 70_000, np.int32), "whole "
+            "numbers"),
             (np.full((4, 4, 4), np.nan, np.float32), "finite"),
         ],
     )  # fmt: skip
@@ -173,7 +178,9 @@ class TestLabelMaps:
 
     @pytest.fixture
     def slicer(self, tmp_path):
-        """Two layers, a kidney and a vessel under a mass; the grid is a part of the CT, as Slicer crops it."""
+        """Two layers, a kidney and a vessel under a mass; the grid is a part of the CT, as Slicer crops
+        it.
+        """
 
         def write(extra="", grid=None):
             empty = grid_around((-33, 18, -401), (-22, 30, -385), (0.7, 0.9, 1.6), DIRECTIONS["oblique"])

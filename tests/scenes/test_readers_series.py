@@ -57,7 +57,9 @@ class TestGeometry:
 
 
 class TestUnevenGaps:
-    """Slices that alternate between two values lose their contrast on a grid that is coarser than they are, or misses them."""
+    """Slices that alternate between two values lose their contrast on a grid that is coarser than they
+    are, or misses them.
+    """
 
     @pytest.mark.parametrize(
         "gaps",

@@ -1,4 +1,6 @@
-"""Files in a CT's folder that are none of its slices, folders that cannot be read, and series that were split."""
+"""Files in a CT's folder that are none of its slices, folders that cannot be read, and series that were
+split.
+"""
 
 import os
 
@@ -89,7 +91,9 @@ def test_a_page_without_a_place_is_left_out_with_a_note(tmp_path, tags, count):
 
 
 def with_slabs(series, count, *kind, first=0.5):
-    """The series, and images that were computed from its slices, under its own UID, from between its slices on."""
+    """The series, and images that were computed from its slices, under its own UID, from between its
+    slices on.
+    """
     series.write()
     for k in range(count):
         tags = dict(

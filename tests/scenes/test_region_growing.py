@@ -1,4 +1,6 @@
-"""Region growing from a seed: synthetic bodies known in LPS mm, the phantom, and real CTs with labels where they are there."""
+"""Region growing from a seed: synthetic bodies known in LPS mm, the phantom, and real CTs with labels
+where they are there.
+"""
 
 from pathlib import Path
 
@@ -31,7 +33,8 @@ RIB = CENTRE + [10.0, 50.0, 0.0], np.array([8.0, 8.0, 1e4])
 CYST = CENTRE + [50.0, 30.0, -50.0], np.array([13.0, 13.0, 13.0])
 GAS = CENTRE + [40.0, -40.0, -40.0], np.array([12.0, 12.0, 12.0])
 FAT_HU = -100.0
-# A surface that is everywhere one working voxel off changes the volume by twice this share, and Dice by about it.
+# A surface that is everywhere one working voxel off changes the volume by twice this share, and Dice by about
+# it.
 ONE_VOXEL = 0.5 * WORKING_MM * (1 / KIDNEY[1]).sum()
 
 
@@ -87,8 +90,8 @@ def coarse():
 
 
 class TestSynthetic:
-    # HU of kidney and liver, noise, and the seed from the centre: enhanced, also beside a large liver; the same HU;
-    # unenhanced, the kidney darkest.
+    # HU of kidney and liver, noise, and the seed from the centre: enhanced, also beside a large liver; the
+    # same HU; unenhanced, the kidney darkest.
     @pytest.mark.parametrize(
         "kidney, liver, touching, noise, off",
         [
@@ -190,7 +193,8 @@ class TestRefused:
         refused(
             ct,
             CENTRE,
-            "edge on [78][0-9]% of its surface.*; to the patient's left and to the head, tissue of like HU.*farther from there",
+            "edge on [78][0-9]% of its surface.*; to the patient's left and to the head, tissue of like "
+            "HU.*farther from there",
         )
 
     def test_kidney_in_one_with_its_neighbours(self):
@@ -208,7 +212,9 @@ class TestRefused:
 
 
 def test_phantom():
-    """Seeds are in cortex and medulla; the tumour, the sinus and its fat belong to the organ and may be missed."""
+    """Seeds are in cortex and medulla; the tumour, the sinus and its fat belong to the organ and may be
+    missed.
+    """
     folder, files = files_of(load_scene(EMBEDDED), EMBEDDED.parent)
     ct, labels = (file_volume(folder / name) for name in (files.ct, files.labels))
     tissue = labels.read(labels.grid.full_box())
@@ -218,7 +224,8 @@ def test_phantom():
 
 
 class TestReal:
-    # Of 16 to 28 seeds a kidney the least was 0.94 (enhanced, by a label that is threshold and growing itself) and 0.86
+    # Of 16 to 28 seeds a kidney the least was 0.94 (enhanced, by a label that is threshold and growing
+    # itself) and 0.86
     # (unenhanced, 3 mm, an extrarenal pelvis at the right one).
     @pytest.mark.parametrize(
         "ct, kidneys, value, least",

@@ -1,4 +1,6 @@
-"""Which segments are the organ: what the user names wins, and derived structures, copies and unknown names are never silent."""
+"""Which segments are the organ: what the user names wins, and derived structures, copies and unknown names
+are never silent.
+"""
 
 import re
 import unicodedata
@@ -60,7 +62,8 @@ NOT_DERIVED = [
     "boxer",
 ]
 LESIONS = {
-    "tumour": "nodule nodules AML oncocytoma Onkozytom Läsion Laesion lesione lesión lesão Raumforderung Nierentumor masse masa nódulo Karzinom "
+    "tumour": "nodule nodules AML oncocytoma Onkozytom Läsion Laesion lesione lesión lesão Raumforderung "
+    "Nierentumor masse masa nódulo Karzinom "
     "carcinome angiomyolipoma metastasis adenoma 肿瘤 腫瘍",
     "cyst": "Zyste kyste quiste cisti cisto Bosniak_2F 囊肿",
     "kidney": "riñón rein Niere rene rim_direito nier 腎 左肾",
@@ -201,7 +204,9 @@ class TestTheUsersWord:
 
 
 class TestUnknown:
-    """A lesion under a name that no list has, within the kidney's label, is named with its volume and place."""
+    """A lesion under a name that no list has, within the kidney's label, is named with its volume and
+    place.
+    """
 
     @pytest.fixture(autouse=True)
     def coarse(self, monkeypatch):

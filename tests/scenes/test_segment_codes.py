@@ -1,4 +1,6 @@
-"""Segments whose names say nothing, such as Segment_1: tissue and side by the codes of 3D Slicer and of DICOM."""
+"""Segments whose names say nothing, such as Segment_1: tissue and side by the codes of 3D Slicer and of
+DICOM.
+"""
 
 import re
 
@@ -32,14 +34,17 @@ CODES = {
     "mass of the right kidney": (ALTERED, MASS, NONE, KIDNEY, RIGHT_CODE, "tumour", {"right"}),
     "mass of no region": (ALTERED, MASS, NONE, NONE, NONE, "tumour", set()),
     "mass of the liver": (ALTERED, MASS, NONE, "SCT^10200004^Liver", NONE, None, set()),
-    "cyst of the adrenal gland": (ALTERED, CYST, NONE, "SCT^23451007^Adrenal gland", LEFT_CODE, None, {"left"}),
+    "cyst of the adrenal "
+    "gland": (ALTERED, CYST, NONE, "SCT^23451007^Adrenal gland", LEFT_CODE, None, {"left"}),
     "cyst of the kidney": (ALTERED, CYST, LEFT_CODE, KIDNEY, LEFT_CODE, "cyst", {"left"}),
     "renal artery": (STRUCTURE, "SCT^2841007^Renal artery", RIGHT_CODE, NONE, NONE, "artery", {"right"}),
     "artery of the kidney": (STRUCTURE, "SCT^51114001^Artery", NONE, KIDNEY, NONE, "artery", set()),
     "renal pelvis": (STRUCTURE, "SCT^25990002^Renal pelvis", NONE, NONE, NONE, "urine", set()),
     "spleen": (STRUCTURE, "SCT^78961009^Spleen", NONE, NONE, NONE, "spleen", set()),
     "both kidneys": (STRUCTURE, KIDNEY, BOTH, NONE, NONE, "kidney", set()),
-    "in German": (STRUCTURE, "SCT^64033007^Organ der Harnbildung", "SCT^7771000^li.", NONE, NONE, "kidney", {"left"}),
+    "in "
+    "German": (STRUCTURE, "SCT^64033007^Organ der "
+            "Harnbildung", "SCT^7771000^li.", NONE, NONE, "kidney", {"left"}),
     "unknown code, known words": (STRUCTURE, "FMA^7205^Left kidney", NONE, NONE, NONE, "kidney", {"left"}),
     "another scheme's number": (STRUCTURE, "FMA^64033007^Femur", NONE, NONE, NONE, "bone", set()),
     "SNOMED RT": ("SRT^T-D0050^Tissue", "SRT^T-71000^", "SRT^G-A100^", NONE, NONE, "kidney", {"right"}),
@@ -174,7 +179,9 @@ def test_sides_that_differ_are_refused(tmp_path, write, name, case):
 
 
 def test_coded_segments_beside_the_organ_are_known(tmp_path):
-    """A spleen by its codes is no label without a meaning, but it cannot be in a kidney; what has none is named with it."""
+    """A spleen by its codes is no label without a meaning, but it cannot be in a kidney; what has none is
+    named with it.
+    """
     _, labels = body(spacing=(6.0, 5.0, 8.0))
     plain = LabelMap.of(labels, {1: "kidney_right", 2: "kidney_left"})
     beside = plain.segments[3]

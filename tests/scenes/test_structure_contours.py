@@ -1,4 +1,6 @@
-"""Contours of a structure set: what stands twice counts once, strokes are united, and planes without a contour are interpolated, or refused."""
+"""Contours of a structure set: what stands twice counts once, strokes are united, and planes without a
+contour are interpolated, or refused.
+"""
 
 import numpy as np
 import pytest
@@ -104,7 +106,9 @@ class TestCopies:
         ("radius", "inner", "aside"), [(20.0, 10.0, 0.0), (20.0, 19.2, 0.0), (20.0, 19.0, 0.9), (2.5, 1.5, 0)]
     )
     def test_a_hole_is_no_copy(self, tmp_path, name, kind, radius, inner, aside):
-        """Not in a wall of a pixel, nor where it is thin on one side alone; of an organ, where the file says so."""
+        """Not in a wall of a pixel, nor where it is thin on one side alone; of an organ, where the file
+        says so.
+        """
         contours = [
             c
             for z in (6.0, 9.0)
@@ -175,7 +179,8 @@ class TestSolids:
             one, (note,) = single(tmp_path, grid_of(3.0), contours)
             drawn = len(inset(BALL, 2.0))
             assert note == (
-                f"region 1: contours that stand twice in a plane, counted once: {drawn}; {drawn} of them differ, and the larger one counts"
+                f"region 1: contours that stand twice in a plane, counted once: {drawn}; {drawn} of them "
+                "differ, and the larger one counts"
             )
             assert millilitres(one) == pytest.approx(millilitres(single(tmp_path, grid_of(3.0), BALL)[0]))
 
@@ -392,7 +397,8 @@ class TestGaps:
         whole, _ = single(tmp_path, grid, spheroid(slice_mm * np.arange(kept[0], kept[-1] + 1), middle, 22.0, length))  # fmt: skip
         assert ndimage.label(one.values)[1] == 1
         assert planes_of(one, grid) == list(range(kept[0], kept[-1] + 1))
-        # Signed distances are interpolated linearly: the convex sections between become smaller by this at most.
+        # Signed distances are interpolated linearly: the convex sections between become smaller by this at
+        # most.
         assert millilitres(one) == pytest.approx(millilitres(whole), rel=0.01)
 
     @pytest.mark.parametrize(("slice_mm", "missing"), [(3.0, 11), (1.25, 30)])
@@ -401,7 +407,8 @@ class TestGaps:
         heights = slice_mm * np.delete(np.arange(5, 50), missing - 5)
         one, notes = single(tmp_path, grid, spheroid(heights, 27.2 * slice_mm, 20.0, 23 * slice_mm))
         assert notes == [
-            f"region 1: slices without a contour, interpolated between their neighbours, at z {missing * slice_mm:.1f} mm"
+            "region 1: slices without a contour, interpolated between their neighbours, at z "
+            f"{missing * slice_mm:.1f} mm"
         ]
         counts = on_planes(one, grid)
         assert counts[missing] == pytest.approx((counts[missing - 1] + counts[missing + 1]) / 2, rel=0.02)
@@ -449,7 +456,9 @@ class TestGaps:
 
     @pytest.mark.parametrize("step", [2, 3])
     def test_contours_on_every_second_slice(self, tmp_path, step):
-        """Even planes stay as they are drawn, as thick as their distance; what lacks among them is interpolated."""
+        """Even planes stay as they are drawn, as thick as their distance; what lacks among them is
+        interpolated.
+        """
         grid = grid_of(2.5)
         kept = np.arange(6, 48, step)
         contours = spheroid(2.5 * kept, 67.0, 20.0, 50.0)

@@ -1,4 +1,6 @@
-"""Surfaces as labels: the voxels are where the surface is, whatever its format, its coordinate system and the way it faces."""
+"""Surfaces as labels: the voxels are where the surface is, whatever its format, its coordinate system and
+the way it faces.
+"""
 
 import numpy as np
 import pytest
@@ -11,7 +13,8 @@ from scenes.patients.organ_support import bed_of_file
 from scenes.patients.readers.label_files import open_labels
 from scenes.volumes.voxel_grid import VoxelGrid
 
-# A CT of slices 5 mm thick; its x and y are not the same as seen from 0, so that RAS is not inside it where LPS is.
+# A CT of slices 5 mm thick; its x and y are not the same as seen from 0, so that RAS is not inside it where
+# LPS is.
 THICK = VoxelGrid.of(grid_around((20, -20, -80), (180, 120, 90), (0.9, 0.8, 5.0), DIRECTIONS["oblique"]))
 RADIUS = 9.0
 

@@ -176,7 +176,9 @@ def test_a_file_of_another_kind(tmp_path, ending, content):
 
 @pytest.mark.parametrize("exact_mm", [(-8.0, 8.0), (-np.inf, 3.0)])
 def test_distances_on_a_grid_are_exact_near_the_surface_and_nearly_so_elsewhere(exact_mm):
-    """Of a box, whose corners and medial planes are the worst for what is between points; the grid does not end at a coarse point."""
+    """Of a box, whose corners and medial planes are the worst for what is between points; the grid does
+    not end at a coarse point.
+    """
     box = trimesh.creation.box([40.0, 30.0, 22.0]).apply_translation([3.0, 1.0, -2.0])
     low, counts, spacing = np.array([-37.0, -31.5, -30.0]), (28, 22, 20), 3.0
     found = distances_on_grid(box, low, counts, spacing, exact_mm)
@@ -187,9 +189,11 @@ def test_distances_on_a_grid_are_exact_near_the_surface_and_nearly_so_elsewhere(
     ]
     truth = np.linalg.norm(np.maximum(over, 0), axis=-1) + np.minimum(over.max(axis=-1), 0)
     away = np.abs(found - truth)
-    # A distance changes by no more than the way to a point at which it is known: half a coarse cell's diagonal.
+    # A distance changes by no more than the way to a point at which it is known: half a coarse cell's
+    # diagonal.
     assert away.max() < spacing * np.sqrt(3)
-    # What is interpolated is off by less than that, and taken as it is only where it is out of the range by itself.
+    # What is interpolated is off by less than that, and taken as it is only where it is out of the range by
+    # itself.
     inner = (truth > exact_mm[0] + spacing * np.sqrt(3)) & (truth < exact_mm[1] - spacing * np.sqrt(3))
     assert away[inner].max(initial=0.0) < 1e-9 and away[truth < 0].max() < (
         1e-9 if exact_mm[0] == -np.inf else 4.0

@@ -144,9 +144,11 @@ def test_parenchyma_is_within_the_surface_and_nothing_of_the_surroundings_in_it(
     at = (index - found.index_from_mm[:3, 3]) @ np.linalg.inv(found.index_from_mm[:3, :3]).T
     away = np.linalg.norm((at - body.organ.center_mass) / (np.ptp(body.organ.vertices, axis=0) / 2), axis=-1)
     parenchyma = found.mask("kidney", "cortex", "medulla")
-    # The surface's grid of 2 mm is right to 0.1 mm about an ellipsoid of 20 mm or more: half a percent of its size.
+    # The surface's grid of 2 mm is right to 0.1 mm about an ellipsoid of 20 mm or more: half a percent of its
+    # size.
     assert parenchyma[away < 0.98].all() and not parenchyma[away > 1.02].any()
-    # Between kidney and fat no film of another tissue: it would be an interface of its own. What touches the other organs is left out.
+    # Between kidney and fat no film of another tissue: it would be an interface of its own. What touches the
+    # other organs is left out.
     shell = (away > 1.02) & (away < 1.1)
     assert found.mask("soft-tissue")[shell].mean() < 0.1
 

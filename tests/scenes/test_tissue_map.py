@@ -93,7 +93,8 @@ def test_labels_win_over_everything_but_the_whole_kidney(level, draws):
     labels = labelled()
     for n, name in enumerate(names):
         labels[ball(*rng.uniform([-20, -16, -36], [20, 16, 36]), 4.0 + n % 3)] = CODE[name]
-    # HU that mean something else: fat in the kidney, bone and gas in labelled muscle. Stones may be in labelled parenchyma and sinus.
+    # HU that mean something else: fat in the kidney, bone and gas in labelled muscle. Stones may be in
+    # labelled parenchyma and sinus.
     hu = scene(level).astype(float)
     hu[(labels > 0) & (labels != CODE["kidney"])] = rng.choice([-900, -100, 60, 120])
     found = found_in(np.rint(hu).astype(np.int16), labels, draws)
@@ -221,7 +222,8 @@ def test_a_groove_is_a_hollow_where_no_ball_goes_in(share, is_closed):
     organ = surface(block, reach_mm=(30.0, 28.0, 34.0))
     shape = KidneyShape.of(organ, INDEX_FROM_MM, SHAPE)
     at = AT[shape.box]
-    # A ball rests on the walls' edges and dips in by R (1 - sqrt(1 - share^2)), 5 mm of 36; the grid is of 2 mm.
+    # A ball rests on the walls' edges and dips in by R (1 - sqrt(1 - share^2)), 5 mm of 36; the grid is of 2
+    # mm.
     deep = (
         (np.abs(at[..., 0]) < width / 2 - 2.5)
         & (at[..., 1] > -9.0)

@@ -48,12 +48,13 @@ def test_a_ball(tumour):
     assert found.tumours == 1
     assert found.diameter_mm == pytest.approx(2 * radius, rel=1e-3)
     assert found.volume_ml == pytest.approx(4 / 3 * np.pi * radius**3 / 1000, rel=0.01)
-    # The convex hull spans the tumour's place by a plane in one direction at least: it is up to the sagitta, r^2 / 2R, under the
-    # ellipsoid, where R is the radius of curvature along the long axis.
+    # The convex hull spans the tumour's place by a plane in one direction at least: it is up to the sagitta,
+    # r^2 / 2R, under the ellipsoid, where R is the radius of curvature along the long axis.
     curvature_mm = HALF_AXES[2] ** 2 / HALF_AXES[0] if centre[2] < 40 else HALF_AXES[0] ** 2 / HALF_AXES[2]
     sagitta = min(radius**2 / (2 * curvature_mm), radius)
     assert -0.01 <= found.exophytic_share - volume <= 0.01 + 0.75 * sagitta / radius * (volume > 0)
-    # Along the edge of the contact, a strip of CONTACT_MM is counted or left out by the angle between both surfaces.
+    # Along the edge of the contact, a strip of CONTACT_MM is counted or left out by the angle between both
+    # surfaces.
     strip = CONTACT_MM * 2 * np.pi * radius * (0 < area < 1)
     assert found.contact_cm2 == pytest.approx(
         ((1 - area) * 4 * np.pi * radius**2) / 100, rel=0.02, abs=strip / 100
@@ -61,7 +62,9 @@ def test_a_ball(tumour):
 
 
 def test_an_oblique_ellipsoid():
-    """Its diameter is its long axis; along an axis p it is 2 |diag(a) R' p| high, within the kidney all around."""
+    """Its diameter is its long axis; along an axis p it is 2 |diag(a) R' p| high, within the kidney all
+    around.
+    """
     half, turn = np.array([9.0, 6.0, 13.0]), Rotation.from_rotvec([0.5, 0.9, -0.4]).as_matrix()
     centre = np.array([4.0, 2.0, 17.0])
     surface = trimesh.creation.icosphere(subdivisions=4)
@@ -80,7 +83,9 @@ def test_an_oblique_ellipsoid():
 
 @pytest.mark.parametrize("depth_mm", [4.0, 10.0, 16.0])
 def test_contact_of_a_ball_cut_by_a_plane(depth_mm):
-    """The spherical cap, 2 pi r d: the formula of Hsieh et al. 2016; and the strip along its edge, in closed form too."""
+    """The spherical cap, 2 pi r d: the formula of Hsieh et al. 2016; and the strip along its edge, in
+    closed form too.
+    """
     radius, half = 10.0, 30.0
     block = trimesh.creation.box([2 * half] * 3)
     tumour = ball([0.0, 0.0, half + radius - depth_mm], radius)

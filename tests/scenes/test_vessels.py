@@ -46,7 +46,9 @@ def test_without_an_aorta_there_is_no_branch():
 
 @pytest.mark.parametrize("has_organ", [False, True])
 def test_blood_is_bright_in_the_mean_of_4_mm_at_the_rim_of_that_and_where_one_voxel_is_brighter(has_organ):
-    """4 mm are 3.8, 3.1 and 0.9 voxels, rounded 4, 3 and 1, and the next odd numbers from these on 5, 3 and 1, as windows by hand."""
+    """4 mm are 3.8, 3.1 and 0.9 voxels, rounded 4, 3 and 1, and the next odd numbers from these on 5, 3
+    and 1, as windows by hand.
+    """
     window, shape = (5, 3, 1), (24, 20, 12)
     hu = np.random.default_rng(3).normal(120.0, 30.0, shape)
     # A hundredth of the voxels has contrast agent.

@@ -1,4 +1,6 @@
-"""The example of docs/adding-a-tissue-model.md, taken from the page, passes the tests of every tissue model."""
+"""The example of docs/adding-a-tissue-model.md, taken from the page, passes the tests of every tissue
+model.
+"""
 
 import re
 import sys

@@ -1,4 +1,6 @@
-"""The capsule: its forces against the energy in NumPy float64, closed forms of an inflated sphere and a stretched sheet."""
+"""The capsule: its forces against the energy in NumPy float64, closed forms of an inflated sphere and a
+stretched sheet.
+"""
 
 import numpy as np
 import pytest
@@ -90,7 +92,8 @@ def test_force_is_the_energys_derivative_and_the_stiffness_bounds_its_own(kept, 
     force, stiffness = forces_of(model, x)
     nodes = np.random.default_rng(1).choice(len(x), 25, replace=False)
     wanted = numeric_force(model.capsule, x, nodes, 1e-4)
-    # Deformations are sums of 8 positions over a cell: off by EPS 40 mm / 4 mm, times stiffness and patches of 16 mm^2.
+    # Deformations are sums of 8 positions over a cell: off by EPS 40 mm / 4 mm, times stiffness and patches
+    # of 16 mm^2.
     tolerance = 30 * EPS * 10 * N_MM * STIFFNESS * 16 / 4
     assert np.abs(wanted).max() > 50 * tolerance
     assert np.abs(force[nodes] - wanted).max() < tolerance
@@ -124,8 +127,8 @@ def test_an_inflated_sphere_has_the_membranes_pressure(kept, ball, stretch):
     force, _ = forces_of(model, x)
     pressure = 2 * STIFFNESS / 3 * N_MM / 12.0 * (1 / stretch - stretch**-7.0)
     wanted = pressure * 4 * np.pi * (stretch * 12.0) ** 2 * 12.0
-    # A patch 3 mm wide is not flat: its tangents are off by up to a quarter of its width over the radius, squared over two;
-    # the ball of 5120 faces lacks 0.2 % of the area.
+    # A patch 3 mm wide is not flat: its tangents are off by up to a quarter of its width over the radius,
+    # squared over two; the ball of 5120 faces lacks 0.2 % of the area.
     assert -(force * model.lattice.nodes).sum() == pytest.approx(wanted, rel=(0.25 * 3 / 12) ** 2 / 2 + 0.003)
     assert np.abs(forces_of(model, 0.9 * model.lattice.nodes)[0]).max() == 0
 
@@ -145,7 +148,8 @@ def test_a_stretched_sheet_has_the_membranes_tension(one_device):
 
 
 def test_a_hanging_block_stretches_as_tissue_and_capsule_side_by_side(one_device):
-    """Mean strain of its weight over E A + E h P: A the section, P its perimeter, E h the capsule's stiffness.
+    """Mean strain of its weight over E A + E h P: A the section, P its perimeter, E h the capsule's
+    stiffness.
 
     The tissue, with nu = 0, hinders the capsule in contracting across, which would make it 4 / 3 as stiff.
     """

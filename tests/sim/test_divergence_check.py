@@ -167,7 +167,8 @@ def test_tissue_near_the_tool_is_not_counted_as_tangled(kept, ball):
     put(solver, solver.body.rest_points * [1, 1, -1])
     at = np.eye(4)
     solver.tool.move(at, at)
-    # Everything is inverted: counted is what is more than 10 mm from the tool's faces, or from the ball around its corners.
+    # Everything is inverted: counted is what is more than 10 mm from the tool's faces, or from the ball
+    # around its corners.
     half = np.array([5.0, 3.0, 5.0])
     at = solver.body.rest_points[array_of(divergence_check.corner)[:, 0]] * [1, 1, -1]
     beyond = (np.abs(at) - half > CRUSHED_MM).any(axis=1)
@@ -281,7 +282,8 @@ def test_clearance_is_not_more_than_the_distance(one_device, ball):
     out = zeros(len(points))
     clearances(shape, field_of(points), out)
     true = np.linalg.norm(points, axis=1) - 12.0
-    # Linear interpolation: an error of less than half the diagonal of a cell; outside the grid of half a cell at most.
+    # Linear interpolation: an error of less than half the diagonal of a cell; outside the grid of half a cell
+    # at most.
     assert (array_of(out) <= true + np.sqrt(3) / 2 * GRID_MM).all()
     near = np.abs(true) < 3.0
     assert array_of(out)[near] == pytest.approx(true[near], abs=0.1)
@@ -308,7 +310,8 @@ def test_a_body_on_few_contact_points_is_at_rest(one_device):
     last = position(solver)
     for _ in range(20):
         solver.step(settings("neo-hookean"))
-        # Positions of 30 mm have 2e-6 mm in float32, which a step of 1/60 s makes 1e-4 mm/s; it shook with 4 mm/s once.
+        # Positions of 30 mm have 2e-6 mm in float32, which a step of 1/60 s makes 1e-4 mm/s; it shook with 4
+        # mm/s once.
         assert np.abs(array_of(solver.body.velocity)).max() < 0.05
     assert np.abs(position(solver) - last).max() < 0.01
 

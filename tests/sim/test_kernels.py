@@ -1,4 +1,6 @@
-"""A kernel takes fields and numbers of its object when it runs, and is compiled once for objects that are alike."""
+"""A kernel takes fields and numbers of its object when it runs, and is compiled once for objects that are
+alike.
+"""
 
 import gc
 import weakref

@@ -36,9 +36,9 @@ def mesh(request, ball, block) -> trimesh.Trimesh:
 def most_missing(mesh: trimesh.Trimesh, cell_mm: float) -> float:
     """The largest error of the tissue's volume [mm^3].
 
-    Distances are interpolated linearly over h = cell / 2, which is off by h^2 / 8 times the second derivatives at
-    most: the two curvatures of the surface. Over the surface that sums to twice the integral of the mean curvature,
-    which is known for edges too (their length times their angle).
+    Distances are interpolated linearly over h = cell / 2, which is off by h^2 / 8 times the second
+    derivatives at most: the two curvatures of the surface. Over the surface that sums to twice the integral
+    of the mean curvature, which is known for edges too (their length times their angle).
     """
     return (cell_mm / 2) ** 2 / 8 * 2 * mesh.integral_mean_curvature
 
@@ -106,7 +106,8 @@ def test_shape_functions_are_one_at_their_corner_and_sum_to_one():
     assert np.abs(shape_functions(at).sum(axis=1) - 1).max() < 1e-13
     ahead, back = at[:, None] + 1e-4 * np.eye(3), at[:, None] - 1e-4 * np.eye(3)
     slope = (shape_functions(ahead.reshape(-1, 3)) - shape_functions(back.reshape(-1, 3))) / 2e-4
-    # Along one edge they are linear, so central differences are exact but for rounding, 1e-16 of up to 8 / 2e-4.
+    # Along one edge they are linear, so central differences are exact but for rounding, 1e-16 of up to 8 /
+    # 2e-4.
     assert np.abs(slope.reshape(200, 3, 8).transpose(0, 2, 1) - shape_gradients(at)).max() < 1e-10
 
 
@@ -121,8 +122,9 @@ def test_linear_fields_have_exactly_their_gradient_and_no_hourglass(mesh):
 
 
 def test_hourglass_is_the_energy_left_out_by_the_mean_gradient(block):
-    # In a whole cell of width h, u = x y has |grad u|^2 = x^2 + y^2 about its mean: h^5 / 6 over the cell; the 6 x 6
-    # midpoints of an edge leave h^2 / 12 / 36 of each square out, h^3 times. All other modes are larger.
+    # In a whole cell of width h, u = x y has |grad u|^2 = x^2 + y^2 about its mean: h^5 / 6 over the cell;
+    # the 6 x 6 midpoints of an edge leave h^2 / 12 / 36 of each square out, h^3 times. All other modes are
+    # larger.
     h = 4.0
     lattice = fill_with_cells(block, h)
     whole = np.flatnonzero(lattice.volume > h**3 * (1 - 1e-12))
@@ -180,10 +182,12 @@ def test_surface_points_are_on_the_surface_and_their_areas_sum_to_its_area(mesh)
     points, area = surface_points(mesh, 2.0)
     assert area.sum() == pytest.approx(mesh.area, rel=1e-12) and area.min() > 0
     assert np.abs(signed(mesh, points)).max() < 1e-12
-    # A cube of 2 mm is cut by at most about three faces' worth of its own; a face at 45 degrees has sqrt(3) of it.
+    # A cube of 2 mm is cut by at most about three faces' worth of its own; a face at 45 degrees has sqrt(3)
+    # of it.
     assert area.max() < 3 * 2.0**2
     assert 0.5 * mesh.area / 2.0**2 < len(points) < 3 * mesh.area / 2.0**2
-    # No position on the surface is farther from a point than a cube's diagonal and the half triangle it may reach out.
+    # No position on the surface is farther from a point than a cube's diagonal and the half triangle it may
+    # reach out.
     samples = trimesh.sample.sample_surface(mesh, 2000, seed=1)[0]
     nearest = np.linalg.norm(samples[:, None] - points[None], axis=2).min(axis=1)
     assert nearest.max() < 2.0 * np.sqrt(3) + 1.0
@@ -202,7 +206,8 @@ def test_pressure_at_the_surface_points_has_the_resultant_of_the_surface(ball):
     normal = points / np.linalg.norm(points, axis=1, keepdims=True)
     below = points[:, 2] < 0
     disc = np.pi * 12.0**2
-    # A point of a cube of 2 mm at the rim is on one side or the other: the rim's half strip, where normals are flat.
+    # A point of a cube of 2 mm at the rim is on one side or the other: the rim's half strip, where normals
+    # are flat.
     assert abs((area[:, None] * normal).sum(axis=0)).max() < 0.01 * disc
     assert -(area * normal[:, 2])[below].sum() == pytest.approx(disc, rel=0.03)
 

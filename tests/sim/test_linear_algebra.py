@@ -1,4 +1,6 @@
-"""The nearest rotation of a million matrices of all kinds, from three kinds of guess, against NumPy in float64."""
+"""The nearest rotation of a million matrices of all kinds, from three kinds of guess, against NumPy in
+float64.
+"""
 
 import numpy as np
 import pytest

@@ -54,7 +54,9 @@ def measure(model: ti.template(), force: ti.template(), hessian: ti.template()):
 
 
 def forces_of(model: NeoHookean, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Elastic forces (n, 3) [uN] at positions x, and their negative derivatives (n, 3, 3) by each node's position."""
+    """Elastic forces (n, 3) [uN] at positions x, and their negative derivatives (n, 3, 3) by each node's
+    position.
+    """
     put(model, x)
     begin(model, DT)
     force, hessian = zeros(len(x), 3, within=1), zeros(len(x), 3, 3, within=2)
@@ -81,9 +83,9 @@ def deformed(x: np.ndarray, noise_mm: float = 0.25) -> np.ndarray:
 def rounding(energy: Energy, x: np.ndarray) -> float:
     """Rounding error of a force in float32 [uN].
 
-    F is a sum of 8 positions times their gradients, 1 / 4 cell each, so that it is off by 8 ^ 0.5 EPS |x| / 4 cell;
-    a stress by (lambda_ + 2 mu) / J^2 as much. A force sums it over 8 cells, times volume / 4 cell = cell^2 / 4 each,
-    and the worst of some hundred nodes is three times as far off as most.
+    F is a sum of 8 positions times their gradients, 1 / 4 cell each, so that it is off by 8 ^ 0.5 EPS |x| / 4
+    cell; a stress by (lambda_ + 2 mu) / J^2 as much. A force sums it over 8 cells, times volume / 4 cell =
+    cell^2 / 4 each, and the worst of some hundred nodes is three times as far off as most.
     """
     cell = energy.lattice.cell_mm
     strain = 8**0.5 * EPS * np.abs(x).max() / 4 / cell
@@ -106,7 +108,8 @@ def test_force_and_hessian_are_the_energys_derivatives(kept, noise_mm):
         tolerance = rounding(energy, x)
         assert np.abs(wanted).max() > 1e4 * tolerance
         assert np.abs(force - wanted).max() < tolerance
-        # Beyond J = 2.7 or so the energy is concave, which the model leaves out; at LEAST_J its curvature jumps.
+        # Beyond J = 2.7 or so the energy is concave, which the model leaves out; at LEAST_J its curvature
+        # jumps.
         j = jacobians(lattice, x)
         wild = (j > 2.5) | (np.abs(j - LEAST_J) < 1e-3)
         calm = np.bincount(lattice.cells[wild].ravel(), minlength=len(x)) == 0
@@ -168,7 +171,8 @@ def test_forces_are_continuous_into_inversion(one_device, block):
     for step in (2e-3, 1e-3):
         ends = [lattice.nodes * [1.0, 1.0, LEAST_J + way * step] for way in (-1, 1)]
         jumps.append(np.subtract(*(forces_of(model, x)[0] for x in ends)))
-    # The change across LEAST_J is proportional to its width, so there is no jump. Curvature is 1 % of it or less.
+    # The change across LEAST_J is proportional to its width, so there is no jump. Curvature is 1 % of it or
+    # less.
     most = np.abs(jumps[0]).max()
     assert most > 100 * rounding(energy, ends[0])
     assert np.abs(jumps[0] - 2 * jumps[1]).max() < 0.02 * most + 4 * rounding(energy, ends[0])
@@ -206,7 +210,8 @@ def test_an_iteration_is_a_gauss_seidel_sweep_over_the_colours(one_device, with_
         change *= np.minimum(1.0, 0.5 * 4.0 / length)
         y[mine] += change if fixed is None else change * ~fixed[mine, None]
     assert capped > 0 and np.abs(y - x).max() > 1.0
-    # A force's rounding over a node's stiffness, at least mu cell / 4: the share of a cell with an eighth of tissue.
+    # A force's rounding over a node's stiffness, at least mu cell / 4: the share of a cell with an eighth of
+    # tissue.
     tolerance = rounding(energy, y) / (energy.mu * 4.0 / 4)
     assert tolerance < 1e-3
     assert np.abs(array_of(model.body.predicted) - y).max() < tolerance
@@ -244,7 +249,8 @@ def test_a_fixed_surface_gives_affine_deformation_with_the_closed_form_stress(ke
     assert np.abs(start - affine).max() > 1.0 and (x[fixed] == affine[fixed].astype(np.float32)).all()
     # A force's rounding over a whole node's stiffness, mu cell and more, spread by its neighbours, ten times.
     assert np.abs(x - affine).max() < 10 * rounding(energy, affine) / (energy.mu * 3.0)
-    # Virtual work: the reactions' power at F' = e_a e_b is the volume times P_ab, with P = mu (F - F^-T) + lambda_ ln J F^-T.
+    # Virtual work: the reactions' power at F' = e_a e_b is the volume times P_ab, with P = mu (F - F^-T) +
+    # lambda_ ln J F^-T.
     inverse = np.linalg.inv(f).T
     p = energy.mu * (f - inverse) + energy.lambda_ * np.log(np.linalg.det(f)) * inverse
     power = -forces_of(model, x)[0].T @ lattice.nodes
@@ -255,7 +261,9 @@ def test_a_fixed_surface_gives_affine_deformation_with_the_closed_form_stress(ke
 
 
 def test_the_rigid_correction_finds_a_fast_spin(one_device, ball):
-    """Inertia alone moves nodes from x to x + w x r, w = 1 rad a step: the nearest rigid motion is a rotation by atan(1)."""
+    """Inertia alone moves nodes from x to x + w x r, w = 1 rad a step: the nearest rigid motion is a
+    rotation by atan(1).
+    """
     model = tissue_of(ball, 4.0).model
     x, mass = model.lattice.nodes, array_of(model.mass).astype(float)
     centre = mass @ x / mass.sum()
@@ -265,12 +273,15 @@ def test_the_rigid_correction_finds_a_fast_spin(one_device, ball):
     begin(model, DT)
     found = array_of(model.body.predicted)
     wanted = centre + (x - centre) @ rotation_about([0, 0, 1], 45).T + DT * np.array([30.0, 0.0, 0.0])
-    # Each Newton step leaves 1 - sqrt(2) of the angle before it, so that after one of 1e-4 mm less than that is left.
+    # Each Newton step leaves 1 - sqrt(2) of the angle before it, so that after one of 1e-4 mm less than that
+    # is left.
     assert np.abs(found - wanted).max() < 2e-4
 
 
 def uniaxial(stretch: float, poisson: float) -> tuple[float, float]:
-    """Lateral stretch q and nominal stress [g/(mm s^2)] of a free bar: mu (q^2 - 1) + lambda_ ln(q^2 stretch) = 0."""
+    """Lateral stretch q and nominal stress [g/(mm s^2)] of a free bar: mu (q^2 - 1) + lambda_ ln(q^2
+    stretch) = 0.
+    """
     mu, lambda_ = lame_parameters(poisson)
     q = brentq(lambda q: mu * (q * q - 1) + lambda_ * np.log(q * q * stretch), 0.5, 2.0)
     return q, mu * (stretch - 1 / stretch) + lambda_ * np.log(q * q * stretch) / stretch
@@ -308,7 +319,8 @@ def test_uniaxial_compression_between_frictionless_plates(one_device, block):
         known = np.column_stack([lattice.nodes[inside], np.ones(inside.sum())])
         # Without friction the block may rotate between the plates: only its stretch is compared.
         measured = polar(np.linalg.lstsq(known, x[inside], rcond=None)[0][:3].T)[1]
-        # What is wrong is the section: as the cells round its edges off, the faces stand out; and what is empty resists.
+        # What is wrong is the section: as the cells round its edges off, the faces stand out; and what is
+        # empty resists.
         whole = (np.abs(lattice.nodes[lattice.cells][:, :, 2].mean(axis=1)) < 3).nonzero()[0]
         area_mm2 = (
             lattice.volume[whole].sum() / (len(np.unique(lattice.nodes[lattice.cells[whole], 2])) - 1) / cell
@@ -347,9 +359,10 @@ def sag(poisson: float, cell: float, iterations: int, side: float = 8.0, span: f
 def beam_error(poisson: float, cell: float, side: float = 8.0, span: float = 40.0) -> float:
     """Tolerance of the sag, relative to Timoshenko's.
 
-    Empty space in cut cells adds ERSATZ times their second moment of area; edges lack tissue, in weight and in
-    stiffness; bending inside cells is HOURGLASS_STIFFNESS / (1 + nu) times as stiff as it should be, and is 1 / n^2 of it all
-    in a beam n cells thick; the clamp keeps the section from widening, which stiffens nu^2 of a length of one side.
+    Empty space in cut cells adds ERSATZ times their second moment of area; edges lack tissue, in weight and
+    in stiffness; bending inside cells is HOURGLASS_STIFFNESS / (1 + nu) times as stiff as it should be, and
+    is 1 / n^2 of it all in a beam n cells thick; the clamp keeps the section from widening, which stiffens
+    nu^2 of a length of one side.
     """
     n = side / cell
     empty = ERSATZ * ((1 + 1 / n) ** 4 - 1)

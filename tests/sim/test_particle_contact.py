@@ -190,7 +190,8 @@ def test_a_body_in_a_mould_of_its_shape_does_not_move_without_gravity(one_device
     solver = solver_of(ball, [SignedDistanceField.of_surface(mould.vertices, mould.faces, 4.0)])
     before = position(solver)
     solver.step(StepSettings(gravity=(0, 0, 0)))
-    # What a grid of 1 mm makes of distances at curvatures of 1 / 10 mm, as above, and how high the facets' chords are.
+    # What a grid of 1 mm makes of distances at curvatures of 1 / 10 mm, as above, and how high the facets'
+    # chords are.
     chord = ball.edges_unique_length.max() ** 2 / 8 / 12
     assert np.abs(position(solver) - before).max() < 1 / 8 * 2 / 10 + chord
 
@@ -270,7 +271,9 @@ def test_a_dragged_tool_moves_the_surface_by_friction(kept, block):
 
 
 def oracle_of_pushes(solver: Solver, x: np.ndarray, motion: np.ndarray, iterations: int, factor: float):
-    """Where particles (n, 3) go in iterations of pushes with Coulomb's friction in float64; how many of those slid, and had two shapes."""
+    """Where particles (n, 3) go in iterations of pushes with Coulomb's friction in float64; how many of
+    those slid, and had two shapes.
+    """
     contacts, start = solver.contacts, position(solver)
     plane, touched = array_of(contacts.plane).astype(float), array_of(contacts.touched)
     x, slid, several = x.copy(), 0, 0
@@ -329,7 +332,8 @@ def test_pushes_and_friction_are_the_oracles(kept, block, factor):
         assert slid > 30 and several > 10
         for _ in range(3):
             push(body, contacts)
-        # Float32 positions of 12 mm carry 1e-6 mm, and the same of each plane's offset, in each of three iterations.
+        # Float32 positions of 12 mm carry 1e-6 mm, and the same of each plane's offset, in each of three
+        # iterations.
         assert np.abs(array_of(body.predicted) - wanted).max() < 2e-5
 
 

@@ -1,4 +1,6 @@
-"""Parts of the organ with their own material: shares of elements, mixture, forces against NumPy, closed forms."""
+"""Parts of the organ with their own material: shares of elements, mixture, forces against NumPy, closed
+forms.
+"""
 
 import numpy as np
 import pytest
@@ -33,7 +35,8 @@ def test_shares_have_the_parts_volumes(organ, cell_mm):
     assert lattice.share.shape == (len(lattice.cells), 2)
     assert lattice.share.min() >= 0 and lattice.share.sum(axis=1).max() <= 1 + 1e-12
     volume = lattice.share.T @ lattice.tissue.sum(axis=1)
-    # Samples a sixth of a cell apart see a surface of radius r to 1 / 24 of their square over r, three times over the volume's r.
+    # Samples a sixth of a cell apart see a surface of radius r to 1 / 24 of their square over r, three times
+    # over the volume's r.
     assert volume == pytest.approx([part.volume for part in parts], rel=0.01)
     centres = lattice.nodes[lattice.cells].mean(axis=1)
     distance = np.linalg.norm(centres - [3.0, 2.0, -1.0], axis=1)
@@ -118,7 +121,8 @@ def test_masses_are_those_of_the_materials(organ):
 
 
 def test_layers_in_series_yield_as_springs_in_series(one_device):
-    """With nu = 0 a column of layers is a chain of springs; the layer that the interface cuts has the mean modulus.
+    """With nu = 0 a column of layers is a chain of springs; the layer that the interface cuts has the mean
+    modulus.
 
     Its ends are moved by 1 % of the length, where Hooke's law is off by about that.
     """
@@ -140,7 +144,8 @@ def test_layers_in_series_yield_as_springs_in_series(one_device):
     compliance = 1 / (15.0 + 75.0 * share)
     wanted = 0.01 * layers * cell * np.append(0, np.cumsum(compliance)) / compliance.sum()
     assert np.abs(moved - wanted[level]).max() < 0.02 * wanted.max()
-    # Reuss's mean, the exact one here, would move the levels above the cut by this much: more than the tolerance.
+    # Reuss's mean, the exact one here, would move the levels above the cut by this much: more than the
+    # tolerance.
     assert np.ptp(moved[level == 4]) < 1e-3
 
 

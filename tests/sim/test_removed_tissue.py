@@ -57,8 +57,8 @@ def missing(tissue: RemovedTissue) -> float:
     """The largest error of the volume of the tissue that remains [mm^3].
 
     A cell's filled part is that of 6 x 6 x 6 samples, each with a linear share over its own width h: on a
-    plane it is exact, on an edge between capsule and bed it is off by some h^2 of an edge's section, along its
-    length; and that of the whole lattice.
+    plane it is exact, on an edge between capsule and bed it is off by some h^2 of an edge's section, along
+    its length; and that of the whole lattice.
     """
     h = CELL_MM / 6
     edge = 2 * np.pi * 15.0

@@ -41,7 +41,8 @@ def test_any_rigid_way_is_found_whole(kept, serial, spin):
     model.body.restore(BodyState(x.astype(np.float32), velocity.astype(np.float32)))
     fill((model.body.predicted, wanted))
     begin(model, DT)
-    # However it moved before. Places of up to 25 mm carry 2e-6 mm in float32, and a turn of as many digits has them for its lever.
+    # However it moved before. Places of up to 25 mm carry 2e-6 mm in float32, and a turn of as many digits
+    # has them for its lever.
     assert np.abs(array_of(model.body.predicted) - wanted).max() < 1.2e-5
 
 
@@ -51,7 +52,9 @@ def move(rigid: ti.template(), dt: float):
 
 
 def nearest_rigid_motion(x: np.ndarray, wanted: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Where a rigid motion of places (n, 3) brings them nearest to others, by weighted squares (Kabsch 1976)."""
+    """Where a rigid motion of places (n, 3) brings them nearest to others, by weighted squares (Kabsch
+    1976).
+    """
     middles = [weight @ places / weight.sum() for places in (x, wanted)]
     u, _, vt = np.linalg.svd((weight[:, None] * (x - middles[0])).T @ (wanted - middles[1]))
     turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt

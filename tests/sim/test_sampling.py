@@ -99,7 +99,8 @@ def test_a_radius_too_large_is_refused(ball):
 
 
 def test_counts_on_a_real_kidney_are_those_of_the_papers_scale(data):
-    # The paper's Fig. 5 has about 15 000 particles and 400 clusters at 2.2 mm for a kidney of this size: at 3.3 mm 4500.
+    # The paper's Fig. 5 has about 15 000 particles and 400 clusters at 2.2 mm for a kidney of this size: at
+    # 3.3 mm 4500.
     kidney = trimesh.load_mesh(data / "truth" / "kits040" / "kidney.stl")
     found = fill_body(kidney, 3.3).particles
     assert len(found) == pytest.approx(4614, rel=0.01)

@@ -41,8 +41,9 @@ def test_particles_that_share_no_cluster_keep_their_distance(kept):
         x = position(solver)
         height[pairs] = x[upper][:, 2].mean() - x[~upper][:, 2].mean()
         if pairs:
-            # The lowest layer, a twelfth of the block, holds its weight, g h^2 = 0.3 mm a substep, in 30 iterations that
-            # share each push between two: 0.3 * 12 / 30 * 2 mm short of the distance, at the averaged pushes.
+            # The lowest layer, a twelfth of the block, holds its weight, g h^2 = 0.3 mm a substep, in 30
+            # iterations that share each push between two: 0.3 * 12 / 30 * 2 mm short of the distance, at the
+            # averaged pushes.
             assert np.linalg.norm(x[upper][:, None] - x[~upper][None], axis=2).min() > 0.75 * 1.5
     assert height[True] == pytest.approx(8.0, abs=1.5)
     assert height[False] < 4.0
@@ -85,7 +86,9 @@ def test_neighbours_are_all_that_are_near_in_ascending_order(kept):
 
 
 def pairs_pass(solver: Solver, moved: np.ndarray, factor: float) -> tuple[np.ndarray, int, int]:
-    """Predicted positions (n, 3) after one iteration over pairs in float64, and how many pairs stick and slide."""
+    """Predicted positions (n, 3) after one iteration over pairs in float64, and how many pairs stick and
+    slide.
+    """
     pairs, body = solver.self_contacts, solver.body
     x = moved + array_of(body.position)
     mass = array_of(body.mass_scale).astype(float) if body.mass_scaled else np.ones(len(x))

@@ -80,7 +80,8 @@ def test_an_iteration_conserves_linear_and_angular_momentum(kept, block, relaxat
     body, model, x = moved_body(kept, block, relaxation)
     project(model, 0.8, 1.0)
     change = array_of(body.predicted) - x
-    # Each of n particles contributes its rounding, which adds like a random walk; the angular sum has lever arms.
+    # Each of n particles contributes its rounding, which adds like a random walk; the angular sum has lever
+    # arms.
     n = len(x)
     assert np.abs(change).sum() > 100
     assert np.abs(change.sum(axis=0)).max() < ROUNDING_MM * n**0.5 * 3

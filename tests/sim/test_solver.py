@@ -66,8 +66,8 @@ def test_free_fall_matches_the_integrator(kept, block, damping):
         fallen += h * velocity
     moved = position(solver) - start_at
     assert fallen < -200
-    # Each of n substeps rounds positions of up to 1300 mm (6e-5 mm) 9 times, at random; what is left over is a
-    # velocity that goes on, so the errors add up twice: to sqrt(n^3 / 3) of one.
+    # Each of n substeps rounds positions of up to 1300 mm (6e-5 mm) 9 times, at random; what is left over is
+    # a velocity that goes on, so the errors add up twice: to sqrt(n^3 / 3) of one.
     n = steps * settings.substeps
     assert np.abs(moved - [0, 0, fallen]).max() < 6e-5 * 9**0.5 * (n**3 / 3) ** 0.5
 
@@ -93,8 +93,8 @@ def test_linear_momentum_is_conserved_without_contact_and_gravity(kept, block, r
     for _ in range(10):
         solver.step(StepSettings(gravity=(0, 0, 0), damping=0.0, stiffness=0.7))
     later = array_of(solver.body.velocity).astype(np.float64)
-    # A cluster's frame rounds by three operations at 40 mm (4e-6 mm), for all its members and the nine iterations of a
-    # substep alike; over clusters and the thirty substeps it adds at random.
+    # A cluster's frame rounds by three operations at 40 mm (4e-6 mm), for all its members and the nine
+    # iterations of a substep alike; over clusters and the thirty substeps it adds at random.
     spread = solver.body.count / solver.model.count**0.5
     rounding = 4e-6 * 180 * spread * 9 * 30**0.5
     assert np.abs(velocity.sum(axis=0)).max() > 1000 * rounding
@@ -114,7 +114,8 @@ def test_angular_momentum_is_conserved_to_the_order_of_the_scheme(kept, block):
         y, v = position(solver), array_of(solver.body.velocity).astype(np.float64)
         before = np.cross(x - x.mean(axis=0), velocity)[:, 2].sum()
         lost.append(1 - np.cross(y - y.mean(axis=0), v)[:, 2].sum() / before)
-    # From 2 x - x_before the projection turns by w h (1 - (w h)^2): that much is lost a substep, h w^2 t in all.
+    # From 2 x - x_before the projection turns by w h (1 - (w h)^2): that much is lost a substep, h w^2 t in
+    # all.
     wanted = [time_step / substeps * turning**2 * steps * time_step for substeps in (4, 8)]
     assert lost == pytest.approx(wanted, rel=0.25)
 
@@ -136,7 +137,9 @@ def test_stiffness_one_moves_a_small_body_rigidly(one_device):
 
 
 def slide(kept, block, slope_deg: float, friction: float = 0.35) -> tuple[float, float]:
-    """Acceleration down a slope over 0.2 s, relative to g, and the final speed [mm/s]; it starts from rest."""
+    """Acceleration down a slope over 0.2 s, relative to g, and the final speed [mm/s]; it starts from
+    rest.
+    """
     angle = np.radians(slope_deg)
     solver = kept(on_floor, block, -8.0, friction)
     settings = StepSettings(
@@ -191,7 +194,8 @@ def test_sliding_over_a_curved_surface_does_not_sink_in(kept, ball):
         solver.step(StepSettings(gravity=(G * np.sin(angle), 0.0, -G * np.cos(angle)), damping=0.0))
         deepest = max(deepest, (np.linalg.norm(position(solver), axis=1) + radius - 13.0).max())
     assert np.linalg.norm(position(solver) - first, axis=1).max() > 1.5
-    # The grid's own distances are off by spacing^2 / 8 times the two curvatures 1 / r, r > 10 mm, towards the inside.
+    # The grid's own distances are off by spacing^2 / 8 times the two curvatures 1 / r, r > 10 mm, towards the
+    # inside.
     assert deepest < 1 / 8 * 2 / 10 + 1e-3
 
 

@@ -1,4 +1,6 @@
-"""Contacts of lattice tissue: Coulomb's law, contact pressures, and rest states that do not depend on the step."""
+"""Contacts of lattice tissue: Coulomb's law, contact pressures, and rest states that do not depend on the
+step.
+"""
 
 import numpy as np
 import pytest
@@ -74,7 +76,8 @@ def test_a_block_sticks_below_the_friction_angle_and_slides_above(kept, block, f
     solver.contacts.coefficient = friction
     built = solver.snapshot()
     assert "stick" in built.history
-    # Depths are pressure * PENALTY_DEPTH_MM / E; a point's height is a sum over 8 nodes, each known to an ulp.
+    # Depths are pressure * PENALTY_DEPTH_MM / E; a point's height is a sum over 8 nodes, each known to an
+    # ulp.
     tolerance = 8 * ULP_MM / layer_depth(solver, G)
     assert tolerance < 0.02
     last = {}
@@ -87,7 +90,8 @@ def test_a_block_sticks_below_the_friction_angle_and_slides_above(kept, block, f
             rest(solver, 40, settings)
             speed.append(array_of(solver.body.velocity)[:, 0].mean())
         force = contact_force(solver, solver.contacts.shapes[0]) / weight(solver)
-        # Gravity acts with sin(angle); Coulomb's friction is at most the coefficient's share of cos(angle), less one degree beyond.
+        # Gravity acts with sin(angle); Coulomb's friction is at most the coefficient's share of cos(angle),
+        # less one degree beyond.
         held = min(np.sin(angle), friction * np.cos(angle))
         assert force == pytest.approx([-held, 0.0, np.cos(angle)], abs=tolerance * np.cos(angle))
         last[beyond_deg] = speed
@@ -105,8 +109,8 @@ def test_a_block_at_rest_has_an_even_contact_pressure(one_device, block):
     depth = layer_depth(solver, 10 * G)
     force = contact_force(solver, solver.contacts.shapes[0]) / (10 * weight(solver))
     assert force == pytest.approx([0.0, 0.0, 1.0], abs=8 * ULP_MM / depth)
-    # Without friction it widens evenly, and each column of it is carried by the pressure below; the corners' few
-    # points also carry what hangs over.
+    # Without friction it widens evenly, and each column of it is carried by the pressure below; the corners'
+    # few points also carry what hangs over.
     assert depth < solver.contacts.measure_penetration() < 1.5 * depth
     assert not hasattr(solver.contacts, "slip") and "stick" not in solver.snapshot().history
 
@@ -134,7 +138,8 @@ def test_a_body_from_outside_a_distance_grid_touches_its_shape(one_device, dome)
     table = trimesh.creation.box([40.0, 40.0, 10.0])
     table.apply_translation([0.0, 0.0, -11.0])
     solver = tissue_of(dome, 4.0, [SignedDistanceField.of_surface(table.vertices, table.faces, REACH_MM)])
-    # Its lowest points, at z = -6, are 15, then 1 mm above the table, whose distances are known 6 mm around it.
+    # Its lowest points, at z = -6, are 15, then 1 mm above the table, whose distances are known 6 mm around
+    # it.
     for above, is_near in ((15.0, False), (1.0, True), (15.0, False)):
         put(solver.model, solver.body.rest_points + [0.0, 0.0, above])
         solver.start_substep(0, 1e-3, 0.0, 0.0, 0.0, 0.0, 0)
@@ -155,13 +160,16 @@ def test_sticking_points_move_with_the_tool(kept, dome):
     most = FRICTION * depth / TANGENTIAL_RATIO
     held = (depth > 0) & (np.linalg.norm(array_of(contacts.slip)[1], axis=1) < 0.8 * most)
     assert held.sum() > 3 and most[held].max() < aside / 2
-    # They move with the tool except for elastic slip, at most friction times depth over TANGENTIAL_RATIO in each direction.
+    # They move with the tool except for elastic slip, at most friction times depth over TANGENTIAL_RATIO in
+    # each direction.
     assert (np.abs(moved - aside) < 2 * most)[held].all()
 
 
 @kernel
 def ask(contacts: ti.template(), pushed: ti.template(), held: ti.template(), at: ti.template()):
-    """Forces, as rows 0, and stiffnesses of ``node_force`` at each node, and of ``point_force`` of each point at a position."""
+    """Forces, as rows 0, and stiffnesses of ``node_force`` at each node, and of ``point_force`` of each
+    point at a position.
+    """
     for i in range(pushed.shape[0]):
         force, stiffness = contacts.node_force(i)
         for row in ti.static(range(3)):
@@ -177,8 +185,9 @@ def ask(contacts: ti.template(), pushed: ti.template(), held: ti.template(), at:
 
 
 def layer_of(contacts, s: int, x: np.ndarray, shifted: np.ndarray, slid: np.ndarray):
-    """Force (p, 3) [uN] and stiffness (p, 3, 3) of shape s on points at x (p, 3) in float64, where its planes have moved
-    by ``shifted`` and the points have slid by ``slid`` (p, 3); which points touch, and which of them slide.
+    """Force (p, 3) [uN] and stiffness (p, 3, 3) of shape s on points at x (p, 3) in float64, where its planes
+    have moved by ``shifted`` and the points have slid by ``slid`` (p, 3); which points touch, and which of
+    them slide.
     """
     plane, near = array_of(contacts.plane)[s].astype(float), (array_of(contacts.near) >> s & 1) == 1
     normal, slip = plane[:, :3], array_of(contacts.slip)[s].astype(float) + slid
@@ -311,8 +320,8 @@ def recovers(solver, wanted) -> None:
     rest(solver, 40, settings_of(12, DOWN), AWAY)
     x = position(solver)
     assert np.isfinite(x).all() and jacobians(solver.model.lattice, x).min() > 0.9
-    # Friction at the base keeps what the base was spread by, 0.35 of a pressure of 0.2 kPa over 15 kPa and 24 mm, and
-    # what that bends the dome by.
+    # Friction at the base keeps what the base was spread by, 0.35 of a pressure of 0.2 kPa over 15 kPa and 24
+    # mm, and what that bends the dome by.
     assert np.abs(np.sort(x[:, 2]) - np.sort(wanted[:, 2])).max() < 0.3
 
 
@@ -398,7 +407,9 @@ def test_the_wrench_on_a_floor_is_the_weight_under_the_centre_of_mass(kept, bloc
 
 
 def test_the_wrench_is_the_sum_of_the_forces_on_the_points(one_device, block):
-    """Of a tool that presses and drags: beside NumPy, and opposite to the forces on the nodes, in all as large."""
+    """Of a tool that presses and drags: beside NumPy, and opposite to the forces on the nodes, in all as
+    large.
+    """
     tool = ConvexTool.cuboid([12.0, 12.0, 8.0], 1.0)
     floor = Plane(UP, -8.0)
     solver = tissue_of(block, 4.0, [floor, tool], FRICTION)

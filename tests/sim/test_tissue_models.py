@@ -146,8 +146,8 @@ def test_without_forces_it_does_not_move(free):
     for _ in range(20):
         free.solver.step(settings)
     n = 20 * settings.substeps
-    # Each of n substeps rounds some ten operations an iteration, at random; what that moves the body by goes on as a velocity, so
-    # that the errors add up twice: to sqrt(n^3 / 3) of one.
+    # Each of n substeps rounds some ten operations an iteration, at random; what that moves the body by goes
+    # on as a velocity, so that the errors add up twice: to sqrt(n^3 / 3) of one.
     rounding = ROUNDING_MM * (10 * settings.iterations) ** 0.5 * (n**3 / 3) ** 0.5
     assert np.abs(free.position() - free.solver.body.rest_points).max() < 3 * rounding
 
@@ -159,7 +159,8 @@ def test_it_falls_freely(free):
         free.solver.step(settings)
     n, h = 10 * settings.substeps, settings.time_step_s / settings.substeps
     fallen = before - free.position()
-    # Symplectic Euler: substep k adds g h^2 k. At 160 mm float32 is off by 1e-5 mm, which goes on as velocity.
+    # Symplectic Euler: substep k adds g h^2 k. At 160 mm float32 is off by 1e-5 mm, which goes on as
+    # velocity.
     assert fallen[:, 2] == pytest.approx(G * h**2 * n * (n + 1) / 2, abs=1e-5 * n**2)
     assert np.abs(fallen[:, :2]).max() < 1e-5 * n**2
 
@@ -181,8 +182,8 @@ def test_rotation_continues(free):
     time_s, h = 10 * settings.time_step_s, settings.time_step_s / settings.substeps
     a, b = before[:, :2], free.surface()[:, :2]
     turned = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
-    # What goes straight ahead by a turn of w h is taken back onto the body, and loses a share (w h)^2 of its spin: in all
-    # h w^2 t, and half of that of its way.
+    # What goes straight ahead by a turn of w h is taken back onto the body, and loses a share (w h)^2 of its
+    # spin: in all h w^2 t, and half of that of its way.
     assert 1 - h * spin**2 * time_s < turned / (spin * time_s) < 1.0
 
 
@@ -205,7 +206,8 @@ def test_attached_points_move_with_the_body(free):
     free.put(rest @ turn.T + way)
     # At 60 mm float32 is off by 4e-6 mm, over some ten operations.
     assert np.abs(free.surface() - (free.mesh.vertices @ turn.T + way)).max() < 1e-4
-    # So is what carries the image plane; elements move what is beside them as the nearest point of the surface, without turning it.
+    # So is what carries the image plane; elements move what is beside them as the nearest point of the
+    # surface, without turning it.
     embedding = Embedding(free.solver.model.carrier, free.mesh, embedding_cell_mm(free.tissue))
     embedding.update()
     rest, at = array_of(embedding.skin.rest), embedding.skin.at
@@ -237,7 +239,8 @@ def test_pressed_it_deforms_and_recovers(laid):
     under = under[(np.abs(under[:, :2]) < [4.0, 2.0]).all(axis=1), 2].max()
     # A coarse skin bulges between what touches, by less than half of the press.
     assert under < height - 3.0
-    # Penetration is 0.05 mm at a pressure of Young's modulus; at a tool's edge the pressure is up to four times that.
+    # Penetration is 0.05 mm at a pressure of Young's modulus; at a tool's edge the pressure is up to four
+    # times that.
     assert laid.solver.contacts.measure_penetration() < 0.2
     laid.press(settings, AWAY_MM, AWAY_MM, 120)
     assert laid.surface()[:, 2].max() == pytest.approx(height, abs=0.3)

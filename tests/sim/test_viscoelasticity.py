@@ -1,4 +1,6 @@
-"""Relaxation of the tissue: stresses of a bar against the hereditary integral, its creep against the closed form."""
+"""Relaxation of the tissue: stresses of a bar against the hereditary integral, its creep against the
+closed form.
+"""
 
 import numpy as np
 import pytest
@@ -22,7 +24,9 @@ MATERIAL = Material(15.0, 0.0, 0.01)
 
 
 def elastic_stress(stretch):
-    """Second Piola-Kirchhoff stress [kPa] along a bar with nu = 0, where the width stays: mu (1 - 1 / stretch^2)."""
+    """Second Piola-Kirchhoff stress [kPa] along a bar with nu = 0, where the width stays: mu (1 - 1 /
+    stretch^2).
+    """
     return MATERIAL.mu / 1e3 * (1 - stretch**-2.0)
 
 
@@ -81,7 +85,8 @@ def test_a_loaded_bar_creeps_as_the_standard_linear_solid(one_device, term):
     load_g = strain * 1e3 * MATERIAL.young_kpa * CELL**2 / gravity / end.sum() * end
     fixed = lattice.nodes[:, 2] < 1e-6
     model = NeoHookean(Body(lattice.nodes), lattice, None, MATERIAL, fixed=fixed, load_g=load_g, prony=[term])
-    # The load has a mass too, which swings, unless damped: in steps of one iteration at most a twentieth of a second.
+    # The load has a mass too, which swings, unless damped: in steps of one iteration at most a twentieth of a
+    # second.
     solver, found = Solver(model), []
     settings = settings_of(60, gravity=(0, 0, gravity), damping=120.0)
     times = np.arange(1, 181) * DT
@@ -97,7 +102,9 @@ def test_a_loaded_bar_creeps_as_the_standard_linear_solid(one_device, term):
 
 
 def test_fast_deformation_is_resisted_by_the_sum_of_all_stiffnesses(one_device):
-    """Force and Hessian without a history are those of elastic tissue times 1 + sum gamma (1 - exp(-x)) / x, x = dt / tau."""
+    """Force and Hessian without a history are those of elastic tissue times 1 + sum gamma (1 - exp(-x)) /
+    x, x = dt / tau.
+    """
     lattice = fill_block(BAR, CELL)
     found = []
     for prony in ((), TERMS):

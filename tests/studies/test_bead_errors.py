@@ -93,7 +93,8 @@ def test_distance_from_the_probe_is_that_of_the_rounded_cuboid_at_its_pose(case)
     pose[:3, :3], pose[:3, 3] = turn, [1.0, 2.0, 3.0]
     local = np.array([[10.0, 0, 0], [0, -7.0, 0], [0, 0, 0], [8.0, 4.0, 5.0]])
     placed = replace(case, poses=pose[None], measured=(local @ turn.T + pose[:3, 3])[None])
-    # Half sizes 8, 4 and 5, edges of 1: beyond a face, beyond a face, inside, at a corner that is rounded off.
+    # Half sizes 8, 4 and 5, edges of 1: beyond a face, beyond a face, inside, at a corner that is rounded
+    # off.
     assert probe_distances(placed)[0] == pytest.approx([2, 3, -4, 3**0.5 - 1])
 
 
@@ -159,7 +160,8 @@ def test_a_pressed_ball_sinks_the_same_every_time_whatever_ran_between(experimen
     again = experiment.run(BRIEF)
     assert np.array_equal(first.beads, again.beads) and not np.array_equal(first.beads, other.beads)
     sunk = (first.beads - case.beads)[:, :, 2].mean(axis=1)
-    # It falls by the 0.2 mm of play at least, and by less than 1 mm; pressed 4 mm, beads sink by some of that.
+    # It falls by the 0.2 mm of play at least, and by less than 1 mm; pressed 4 mm, beads sink by some of
+    # that.
     assert first.finite and -1.0 < sunk[0] < -0.15 and -3.0 < sunk[2] - sunk[0] < -0.3
 
 

@@ -84,7 +84,8 @@ def test_frequency_and_damping_of_a_noisy_creeping_signal():
     noise = np.random.default_rng(0).normal(scale=0.02, size=len(time))
     height = swing(time, 7.7, 0.05, -6.5) - 0.5 * (1 - np.exp(-3 * time)) + noise
     found = oscillation(time, height)
-    # A sinusoid of amplitude A in noise s, N samples over T: the frequency's variance is 6 s^2 / (pi^2 A^2 N T^2)
+    # A sinusoid of amplitude A in noise s, N samples over T: the frequency's variance is 6 s^2 / (pi^2 A^2 N
+    # T^2)
     # (Cramer and Rao), 0.02 Hz in the last window (A = 1.7 mm, N = 26, T = 0.26 s) and less in those before.
     assert abs(found.hz - 7.7) < 3 * 0.02
     assert found.error_hz < 3 * 0.02
@@ -100,7 +101,8 @@ def test_no_frequency_without_enough_swings(height):
 
 
 def test_theory_of_a_heavy_load_is_a_spring_that_carries_some_of_the_beam():
-    # Rayleigh: 33/140 of the beam's mass swings with the load, to 1 in 1000 where the load is five times the beam.
+    # Rayleigh: 33/140 of the beam's mass swings with the load, to 1 in 1000 where the load is five times the
+    # beam.
     material = BeamMaterial(263.8, 0.499, 1.07)
     _, hz = theory([30.0, 30.0, 100.0], material, 500.0)
     stiffness = 3 * 263.8e3 * 0.03**4 / 12 / 0.1**3
@@ -113,15 +115,16 @@ def test_a_slender_beam_sags_and_swings_as_beam_theory_says(device, load_g):
     beam = Cantilever(size, material, 5.0, load_g)
     sag, hz = theory(size, material, load_g)
     rest_mm, left_mm = beam.rest()
-    # Bending inside the cells is exact; shear is 2% of the sag. The sag is 4% of the length at most: theory's small angles cost
+    # Bending inside the cells is exact; shear is 2% of the sag. The sag is 4% of the length at most: theory's
+    # small angles cost
     # 0.1%, and straight cells along the length 1/(4 x 12^2) = 0.2%.
     assert -rest_mm[0, 0] == pytest.approx(sag, rel=0.01)
     assert left_mm < 0.005
     frame = 0.04 / hz
     height = beam.swing(125, frame)[:, 0, 0]
     found = oscillation(frame * np.arange(len(height)), height)
-    # Shear and the turning of the sections, which the frequency's theory leaves out, take up to 1.6% off, masses
-    # lumped at the nodes up to 1%.
+    # Shear and the turning of the sections, which the frequency's theory leaves out, take up to 1.6% off,
+    # masses lumped at the nodes up to 1%.
     assert found.hz == pytest.approx(hz, rel=0.03)
     # Implicit steps damp by half of their angle.
     step = frame / beam.substeps(frame)
@@ -164,7 +167,8 @@ def test_the_command_compares_draws_and_reports(tmp_path, capsys):
     assert "first frequency" in printed
     as_above = re.search(r"as above +([\d.]+) mm +([\d.]+) Hz", printed)
     assert float(as_above[2]) == pytest.approx(row["computed_hz"], abs=1e-4)
-    # Rests on cells twice as wide as the row's: stiffer in bending by the hourglass term, 5% with two cells in the height.
+    # Rests on cells twice as wide as the row's: stiffer in bending by the hourglass term, 5% with two cells
+    # in the height.
     assert float(as_above[1]) == pytest.approx(row["computed_mm"], rel=0.1)
     assert all(f"  {name}  " in printed for name in ("half the time step", "twice the iterations"))
 
@@ -189,8 +193,8 @@ def test_the_silicone_beam_within_a_tenth(device, data):
     for capture, low, high in zip(captures[::2], (6.2, 16.7, 25.0), (6.9, 17.7, 28.0), strict=True):
         assert low < mean_length(capture.final_mm()) < high
     measured = measured_oscillation(captures[0])
-    # Poisson's ratio is 0.499; 0.45 is 10 times quicker and moves the rest by 2%, the frequency by 1%. The rest is for
-    # what 10 mm cells add to 4%, by which the finer ones of the command are off.
+    # Poisson's ratio is 0.499; 0.45 is 10 times quicker and moves the rest by 2%, the frequency by 1%. The
+    # rest is for what 10 mm cells add to 4%, by which the finer ones of the command are off.
     size = np.array([30.0, 30.0, 100.0])
     beam = Cantilever(size, BeamMaterial(263.8, 0.45, 1.07), 10.0, 0.0, markers_on(size))
     assert mean_length(beam.rest()[0]) == pytest.approx(mean_length(captures[0].final_mm()), rel=0.1)

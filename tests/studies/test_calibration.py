@@ -52,7 +52,9 @@ def cases(folders) -> list[BeadCase]:
 
 
 def pretended(case: BeadCase, setup: Setup) -> Measured:
-    """Errors as if each radius had a best stiffness; the last stage has another, which must not be seen in a fit."""
+    """Errors as if each radius had a best stiffness; the last stage has another, which must not be seen in
+    a fit.
+    """
     off = np.array(
         [setup.tissue.stiffness - BEST[setup.tissue.radius_mm]] * 2 + [setup.tissue.stiffness - 0.9]
     )

@@ -1,4 +1,6 @@
-"""A cohort: its table, what is read of an earlier one, and patients whose computation fails or ends its process."""
+"""A cohort: its table, what is read of an earlier one, and patients whose computation fails or ends its
+process.
+"""
 
 import csv
 import json

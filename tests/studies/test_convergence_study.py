@@ -41,7 +41,9 @@ def test_each_change_is_of_one_setting(model):
 
 
 class Drifting:
-    """Stands for an Experiment: its beads drift along x by what the setup has of iterations, steps and cells."""
+    """Stands for an Experiment: its beads drift along x by what the setup has of iterations, steps and
+    cells.
+    """
 
     def __init__(self, case: BeadCase, setup: Setup) -> None:
         self.case, self.cell_mm = case, setup.size_mm

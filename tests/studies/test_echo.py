@@ -32,7 +32,8 @@ def phantom(request):
 
 
 def test_widths_lengths_and_levels_are_within_the_bars_of_simus(phantom, monkeypatch):
-    # With a third of the places the level of a cyst is 0.5 dB off, and with a quarter of the beats a mean velocity 2 %.
+    # With a third of the places the level of a cyst is 0.5 dB off, and with a quarter of the beats a mean
+    # velocity 2 %.
     monkeypatch.setattr(echo_rows, "CYST_POINTS", 10_000)
     monkeypatch.setattr(echo_phantom, "BEATS", 50)
     name, test_object = phantom

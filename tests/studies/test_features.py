@@ -1,4 +1,6 @@
-"""A scene pays only for what it declares: what is off is neither compiled nor allocated; and a soak ends as it began."""
+"""A scene pays only for what it declares: what is off is neither compiled nor allocated; and a soak ends
+as it began.
+"""
 
 import functools
 import json

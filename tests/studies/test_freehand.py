@@ -86,7 +86,9 @@ def marked() -> Sweep:
 
 
 def check_balls(rebuilt: SweepVolumes, off_mm: float) -> None:
-    """An outline that is off by a quarter of a voxel on average takes 3 / 8 of one over the radius off Dice."""
+    """An outline that is off by a quarter of a voxel on average takes 3 / 8 of one over the radius off
+    Dice.
+    """
     at = rebuilt.box.places()
     for name, middle, radius in (("organ", CENTRE, RADIUS), ("tumour", TUMOUR, TUMOUR_RADIUS)):
         figures = segmentation_metrics(
@@ -118,7 +120,8 @@ def test_balls_are_reconstructed_at_their_positions(marked, method, off_mm):
     assert shown == {"images": len(marked), "fill holes": 2}
     check_balls(rebuilt, off_mm)
     assert sorted(rebuilt.beads) == [0, 1]
-    # Some hundred pixels in a ball of 2 mm, of 0.5 x 0.8 x 0.8 mm: the mean of their middles is off by less than a tenth of one.
+    # Some hundred pixels in a ball of 2 mm, of 0.5 x 0.8 x 0.8 mm: the mean of their middles is off by less
+    # than a tenth of one.
     for bead, middle in rebuilt.beads.items():
         assert middle == pytest.approx(BEADS[bead], abs=0.08)
 
@@ -170,7 +173,8 @@ def test_only_the_field_of_view_counts():
     assert np.array_equal(mask, SECTOR)
     rebuilt = reconstruct_volumes(sweep, image_poses_of(sweep, "Reference"), mask, 1.0, "smooth", 2.0)
     np.testing.assert_allclose(rebuilt.grey[rebuilt.known], 120, rtol=1e-6)
-    # Voxels on the border count as soon as a pixel is in them: half a voxel farther out on average, and gaps are closed.
+    # Voxels on the border count as soon as a pixel is in them: half a voxel farther out on average, and gaps
+    # are closed.
     volume, sides = SECTOR.sum() * 0.4 * 0.8 * len(images), 2 * (46 + 48) * 46 + 2 * 46 * 48
     assert volume < rebuilt.known.sum() < volume + 0.6 * sides
     small = replace(sweep, images=sweep.images[:, :20])
@@ -399,7 +403,8 @@ def test_the_study_prints_and_draws_both(runs, tmp_path):
         line for line in lines if line.startswith("pressed 4 mm") and "corrected" in line and "tumour" in line
     )
     assert f"{row['dice']:.3f}" in printed and f"{row['centroid_mm']:.2f}" in printed
-    # Two lines of head, then two methods, three of the noise or two, and two by two of the press; of two regions, or of one.
+    # Two lines of head, then two methods, three of the noise or two, and two by two of the press; of two
+    # regions, or of one.
     assert len(lines) == 2 + 2 * (2 + 3 + 4) + 2 + (2 + 2)
     assert sum(line.startswith("every third image, no error") for line in lines) == 3
     write_csv([row for run in runs for row in rows_of(run)], tmp_path / "a.csv")

@@ -1,4 +1,6 @@
-"""The study of graphics cards: differences from the processor's results, what is not as asked, and processes that fail."""
+"""The study of graphics cards: differences from the processor's results, what is not as asked, and
+processes that fail.
+"""
 
 import os
 import signal

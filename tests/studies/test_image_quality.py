@@ -40,9 +40,11 @@ def test_a_trend_with_depth_is_removed(noise):
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_filtered_noise_correlates_as_its_filter_with_itself(noise, axis):
-    # A Gaussian of SD s gives exp(-d^2 / (4 s^2)) of the signal and its square of the intensity: 1/2 at s sqrt(2 ln 2).
+    # A Gaussian of SD s gives exp(-d^2 / (4 s^2)) of the signal and its square of the intensity: 1/2 at s
+    # sqrt(2 ln 2).
     filtered = gaussian_filter1d(noise, 4.0, axis=axis, mode="wrap")
-    # 400 / (4 sqrt(pi)) = 56 independent values on each of 400 lines: 1 / sqrt(400 * 56) = 0.7 % of the correlation, which falls by 0.15 a sample there.
+    # 400 / (4 sqrt(pi)) = 56 independent values on each of 400 lines: 1 / sqrt(400 * 56) = 0.7 % of the
+    # correlation, which falls by 0.15 a sample there.
     assert correlation_length(np.abs(filtered), axis) == pytest.approx(4.0 * np.sqrt(2 * np.log(2)), rel=0.03)
     assert correlation_length(np.abs(filtered), 1 - axis) < 1.0
 
@@ -53,13 +55,16 @@ def test_what_never_decorrelates_has_no_length():
 
 @pytest.mark.parametrize("decibel", [-3.0, -12.0, -25.0])
 def test_a_lesion_has_its_contrast_and_the_gcnr_of_two_exponentials(noise, decibel):
-    """Intensity of speckle is exponential: the densities of means a < b cross at x = ln(b / a) a b / (b - a)."""
+    """Intensity of speckle is exponential: the densities of means a < b cross at x = ln(b / a) a b / (b -
+    a).
+    """
     outside, inside = np.abs(noise[:200]), np.abs(noise[200:]) * 10 ** (decibel / 20)
     ratio = 10 ** (-decibel / 10)
     crossing = np.log(ratio) * ratio / (ratio - 1)
     expected = np.exp(-crossing / ratio) - np.exp(-crossing)
     assert contrast_db(inside, outside) == pytest.approx(decibel, abs=0.1)
-    # Of 80,000 values the overlap has an SD of 0.002; empty and full bins add up to 1 / sqrt(800) of the overlap's part.
+    # Of 80,000 values the overlap has an SD of 0.002; empty and full bins add up to 1 / sqrt(800) of the
+    # overlap's part.
     assert gcnr(inside, outside) == pytest.approx(expected, abs=0.015)
     # Whatever the grey map.
     assert gcnr(inside**0.25, outside**0.25) == pytest.approx(gcnr(inside, outside), abs=1e-9)

@@ -33,7 +33,8 @@ def case(tmp_path_factory, one_device) -> BeadCase:
     written["material"]["part"] = [
         dict(name="sinus", surface="sinus.stl", young_kPa=5.0, poisson=0.45, density=1050.0)
     ]
-    # Of a core of 7 mm (two thirds of that volume) beads and force hardly show the modulus: on one processor it was found 26 % off.
+    # Of a core of 7 mm (two thirds of that volume) beads and force hardly show the modulus: on one processor
+    # it was found 26 % off.
     core = trimesh.creation.icosphere(subdivisions=3, radius=8.0)
     core.export(folder / "sinus.stl")
     empty = load_case(write_case(folder, written))
@@ -61,9 +62,9 @@ def test_moduli_that_it_is_not_told_are_found(case, workers):
     found = found_by(case, workers)
     wanted = {"modulus": 22.0, "sinus modulus": 5.0, "Poisson's ratio": 0.4, "friction": FRICTION}
     assert found.keys() == wanted.keys()
-    # Points come into contact one by one, which makes the residuals of so small a body rough: its beads are within 0.01 mm at
-    # values that differ by 10 % and more, by rounding alone. It started at half of the modulus. The ball sticks to the probe, so that any
-    # friction fits.
+    # Points come into contact one by one, which makes the residuals of so small a body rough: its beads are
+    # within 0.01 mm at values that differ by 10 % and more, by rounding alone. It started at half of the
+    # modulus. The ball sticks to the probe, so that any friction fits.
     for name, value in wanted.items():
         assert name == "friction" or found[name]["found"] == pytest.approx(value, rel=0.25), name
     for name in wanted:

@@ -1,4 +1,6 @@
-"""B-mode images of patients: figures of truths made by hand, a made CT, a real one where it is, and the command."""
+"""B-mode images of patients: figures of truths made by hand, a made CT, a real one where it is, and the
+command.
+"""
 
 import json
 from itertools import islice
@@ -119,7 +121,10 @@ class TestOutline:
 
 
 def ball_anatomy(*, plate=None, agent=None, kidney_hu=KIDNEY):
-    """A kidney that is a ball of RADIUS about the origin in fat, 1 mm voxels; beyond 40 mm water. A plate: (lowest y, highest y, HU)."""
+    """A kidney that is a ball of RADIUS about the origin in fat, 1 mm voxels; beyond 40 mm water.
+
+    A plate: (lowest y, highest y, HU).
+    """
     place = np.moveaxis(np.indices((101, 101, 101)), 0, -1) - 50.0
     away = np.linalg.norm(place, axis=-1)
     hu = np.select([away <= RADIUS, away <= 40], [kidney_hu, FAT], 0.0).astype(np.float32)
@@ -200,7 +205,9 @@ class TestTruth:
 
 
 def scanline_truth(power, incidence=0.0, surface=10.0, back=40.0, agent=np.inf):
-    """60 scanlines of 600 samples, 0.1 mm apart, through a kidney between two depths, with contrast agent from a depth on for 5 mm."""
+    """60 scanlines of 600 samples, 0.1 mm apart, through a kidney between two depths, with contrast agent
+    from a depth on for 5 mm.
+    """
     depth = (np.arange(600) + 0.5) * 0.1
     signed = np.maximum(surface - depth, depth - back)
     shape = 60, 600
@@ -240,7 +247,9 @@ class TestScanlineFigures:
         assert np.isnan(list(nothing.values())).all()
 
     def test_the_greatest_of_speckle_is_its_own_control(self):
-        """Of n independent samples of exponential power the greatest is on average the n-th harmonic number."""
+        """Of n independent samples of exponential power the greatest is on average the n-th harmonic
+        number.
+        """
         draw = np.random.default_rng(4)
         truth = scanline_truth(np.ones_like)
         speckle = ScanlineTruth(draw.exponential(1.0, (60, 600)), *list(vars(truth).values())[1:])
@@ -298,7 +307,8 @@ class TestSignalToNoise:
             depth = share * probe.depth_mm
             window = np.abs(phantom.depth_mm - depth) < 3.0
             signal, own, both = (each[middle, window].mean() for each in (silent, noise, with_noise))
-            # A thousand speckles, whose mean power has an error of 3 %; tissue samples are up to half a voxel deeper.
+            # A thousand speckles, whose mean power has an error of 3 %; tissue samples are up to half a voxel
+            # deeper.
             assert 10 * np.log10(signal / own) == pytest.approx(snr_db(probe, depth), abs=0.8)
             assert both == pytest.approx(signal + own, rel=0.1)
 
@@ -320,7 +330,8 @@ class TestPlanes:
         for pose in planes.values():
             assert pose[:3, :3] @ pose[:3, :3].T == pytest.approx(np.eye(3), abs=1e-9)
             face = on_scanlines(probe, pose, np.zeros(1))[:, 0]
-            # The face is 4 mm high: where the beam is aslant on the surface, the middle of it is off by up to 2 mm times the slope.
+            # The face is 4 mm high: where the beam is aslant on the surface, the middle of it is off by up to
+            # 2 mm times the slope.
             assert -0.05 < in_ellipsoid(face).min() < 0.6
 
     def test_front_is_the_patients_front_and_the_side_is_opposite_the_hilum(self):
@@ -336,7 +347,9 @@ class TestPlanes:
 
 
 def made_patient():
-    """A small CT, unenhanced, in which the kidney alone is labelled: an ellipsoid in fat, before muscle, with bowel gas."""
+    """A small CT, unenhanced, in which the kidney alone is labelled: an ellipsoid in fat, before muscle,
+    with bowel gas.
+    """
     spacing = np.array([1.5, 1.5, 3.0])
     count = np.array([80, 80, 48])
     low = -spacing * (count - 1) / 2

@@ -52,7 +52,9 @@ def cube(cells: int, distortion_mm: float = 0.0) -> FemSolid:
 
 
 def on_faces(solid: FemSolid) -> np.ndarray:
-    """Which nodes lie on which of the cube's six faces, shape (nodes, 3, 2): at 0 and at SIDE_MM along each axis."""
+    """Which nodes lie on which of the cube's six faces, shape (nodes, 3, 2): at 0 and at SIDE_MM along
+    each axis.
+    """
     return np.abs(solid.rest[..., None] - [0.0, SIDE_MM]) < 1e-9
 
 
@@ -109,7 +111,9 @@ def test_uniaxial_compression_gives_the_closed_form_force(poisson):
 
 
 def test_the_error_falls_with_the_third_power_of_the_mesh():
-    """u_x = a sin(k z) is a shear with J = 1, so P_xz = mu a k cos(k z): in balance with b_x = mu a k^2 sin(k z)."""
+    """u_x = a sin(k z) is a shear with J = 1, so P_xz = mu a k cos(k z): in balance with b_x = mu a k^2
+    sin(k z).
+    """
     a, k = 1.0, np.pi / SIDE_MM
 
     def error(cells: int) -> float:
@@ -192,8 +196,8 @@ def test_friction_of_a_block_that_slides_is_coulombs():
         force = plane.force(state)[1]
         ratios.append(-force[0] / force[2])
     assert ratios[0] < 0.01 and np.all(np.diff(ratios[:3]) > 0)
-    # All points slide the same way once the sliding outweighs the block's spreading before it: the angle that is
-    # left between them falls with each increment, and its cosine is lost from the sum.
+    # All points slide the same way once the sliding outweighs the block's spreading before it: the angle that
+    # is left between them falls with each increment, and its cosine is lost from the sum.
     assert ratios[-1] == pytest.approx(0.35, abs=1e-3)
     assert max(ratios) <= 0.35 * (1 + 1e-9)
 
@@ -300,7 +304,9 @@ def shape_of(local: np.ndarray) -> np.ndarray:
 
 
 def test_the_files_agree_on_the_deformation(solved_case, tmp_path):
-    """Beads through result.npz alone: shape functions of the file's order of nodes, also in curved tetrahedra."""
+    """Beads through result.npz alone: shape functions of the file's order of nodes, also in curved
+    tetrahedra.
+    """
     solved_case.write(tmp_path)
     result = np.load(tmp_path / "result.npz")
     table = np.genfromtxt(tmp_path / "beads.csv", delimiter=",", skip_header=1)[:, 1:].reshape(12, 3, 3)

@@ -1,4 +1,6 @@
-"""The study of the resection: its voxels against closed forms, what counts as a failure, and what the command writes."""
+"""The study of the resection: its voxels against closed forms, what counts as a failure, and what the
+command writes.
+"""
 
 import json
 import sys
@@ -36,8 +38,8 @@ FIGURES = CutFigures(3.0, 4.0, 100.0, 10.0, 0.0, 5.0)
 def test_voxels_inside_a_surface_have_its_volume(surface):
     grid = RasterGrid.around([surface], VOXEL_MM, 1.0)
     inside = grid.inside(surface)
-    # Each voxel at the surface is off by up to half, at random: the error of their sum grows as the root of their number. Faces along
-    # the voxels are off together, by up to half a voxel on each side.
+    # Each voxel at the surface is off by up to half, at random: the error of their sum grows as the root of
+    # their number. Faces along the voxels are off together, by up to half a voxel on each side.
     along = np.asarray(surface.area) * VOXEL_MM / 2 if len(surface.faces) == 12 else 0.0
     at_random = 3 * VOXEL_MM**3 * np.sqrt(surface.area / VOXEL_MM**2) / 2
     assert inside.sum() * VOXEL_MM**3 == pytest.approx(surface.volume, abs=along + at_random)
@@ -52,7 +54,8 @@ def test_the_distance_map_is_the_distance_from_a_ball():
     exact = np.linalg.norm(grid.low_mm + VOXEL_MM * index, axis=-1) - 9.0
     found = signed_distance_map(inside, VOXEL_MM)
     assert ((found < 0) == inside).all()
-    # A voxel of the surface has a neighbour on its other side: it is within the diagonal of a voxel of it, and half a voxel in the mean.
+    # A voxel of the surface has a neighbour on its other side: it is within the diagonal of a voxel of it,
+    # and half a voxel in the mean.
     error = np.abs(found - exact)
     assert error.max() < VOXEL_MM * np.sqrt(3) and error.mean() < VOXEL_MM / 2
 

@@ -1,4 +1,6 @@
-"""Echoes of real scanners: each part against synthetic data whose truth is known, and on the recordings, where they are."""
+"""Echoes of real scanners: each part against synthetic data whose truth is known, and on the recordings,
+where they are.
+"""
 
 import json
 
@@ -57,7 +59,9 @@ def test_the_autocorrelation_is_that_of_a_turning_phase():
 
 class TestRotatingDisc:
     def test_our_doppler_finds_a_known_rotation(self, device):
-        """IQ of scatterers everywhere whose phase turns by the rotation's axial velocity: 4 pi f v / (c PRF) from pulse to pulse."""
+        """IQ of scatterers everywhere whose phase turns by the rotation's axial velocity: 4 pi f v / (c
+        PRF) from pulse to pulse.
+        """
         data = channel_data()
         phantom = EchoPhantom(rotating_disc.probe_of(data))
         x = phantom.probe.elements()[:, 0] / 1e3
@@ -69,7 +73,8 @@ class TestRotatingDisc:
         found = rotating_disc.our_velocity(
             phantom, echoes[..., None] * np.exp(1j * turn[..., None] * np.arange(16))
         )
-        # Within 0.74 m/s nothing aliases; the sample volume averages about 1 mm of a velocity that changes by 0.03 m/s.
+        # Within 0.74 m/s nothing aliases; the sample volume averages about 1 mm of a velocity that changes by
+        # 0.03 m/s.
         inner = slice(10, -10)
         assert found[inner, 4:-4] == pytest.approx(away[inner, 4:-4], abs=0.02)
         fitted = rotating_disc.fitted_rotation(
@@ -97,7 +102,9 @@ class TestRotatingDisc:
         assert distance[within].max() < 0.0092 and within[distance < 0.0085].all()
 
     def test_a_point_is_beamformed_where_it_is(self):
-        """One scatterer below the array: a plane wave reaches it after z / c, and each element after its distance."""
+        """One scatterer below the array: a plane wave reaches it after z / c, and each element after its
+        distance.
+        """
         data = channel_data()
         x, z = (np.arange(128) - 63.5) * data.pitch_m, 0.015
         arrival = (z + np.hypot(x - 0.002, z)) / data.sound_m_s
@@ -179,7 +186,8 @@ class TestWires:
     def test_our_width_is_that_of_the_profile(self):
         probe = load_probe("linear")
         widths = [wire_widths.beam_width_mm(probe, 24.0, level) for level in (-3.0, -6.0, -20.0)]
-        # At the focus two apertures make sinc^2, 1/2 over 0.886 wavelengths f-number; the pulse has lower frequencies too, and elements width.
+        # At the focus two apertures make sinc^2, 1/2 over 0.886 wavelengths f-number; the pulse has lower
+        # frequencies too, and elements width.
         assert widths == sorted(widths)
         assert widths[1] == pytest.approx(0.886 * probe.wavelength_mm * probe.f_number, rel=0.15)
 
@@ -210,7 +218,9 @@ class TestGreyMaps:
         )
 
     def test_pictures_of_both_recordings_are_the_fourth_root_of_the_amplitude(self, recordings):
-        """PLUS's own formula, to the pixel: 20 times the fourth root, truncated, then interpolated and rounded."""
+        """PLUS's own formula, to the pixel: 20 times the fourth root, truncated, then interpolated and
+        rounded.
+        """
         iq, picture = read_iq(recordings / BK_IQ), read_picture(recordings / BK_PICTURE)
         line, sample = grey_maps.curved_source(picture, *iq.shape)
         sector = np.isfinite(line)
@@ -231,7 +241,9 @@ class TestCurvedArray:
         return EchoPhantom(recorded_speckle.probe_of(1740), 256)
 
     def test_our_scan_conversion_puts_samples_where_plus_does(self, phantom):
-        """A ramp of dB over depth, one over the scanlines: at each pixel it is that of the picture's own geometry."""
+        """A ramp of dB over depth, one over the scanlines: at each pixel it is that of the picture's own
+        geometry.
+        """
         probe, picture = phantom.probe, np.zeros((400, 600))
         line, sample = grey_maps.curved_source(picture, probe.number_of_scanlines, 1740)
         inner = (line > 3) & (line < 354) & (sample > 20) & (sample < 1700)

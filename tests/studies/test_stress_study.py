@@ -1,4 +1,6 @@
-"""The stress test applies what a case names, measures recovery from the rest position, and gives a reason where there is none."""
+"""The stress test applies what a case names, measures recovery from the rest position, and gives a reason
+where there is none.
+"""
 
 import csv
 import json

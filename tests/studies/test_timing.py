@@ -52,7 +52,8 @@ def test_a_step_in_pieces_is_the_step(device, ball, model):
             step(poses)
         ends.append(array_of(solver.body.position).astype(float))
     assert np.abs(ends[0] - solver.body.rest_points).max() > 1.0
-    # Compiled otherwise, sums round otherwise: 1e-6 mm a pass at 12 mm, in a hundred passes that do not forget it.
+    # Compiled otherwise, sums round otherwise: 1e-6 mm a pass at 12 mm, in a hundred passes that do not
+    # forget it.
     assert np.abs(ends[1] - ends[0]).max() < 1e-3
     assert tuple(phases.ms) == phases.names()
     assert min(phases.ms.values()) > 0

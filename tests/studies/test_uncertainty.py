@@ -1,4 +1,6 @@
-"""The study of uncertainty: what is varied, its bands and indices against a known function, and the panel's bands."""
+"""The study of uncertainty: what is varied, its bands and indices against a known function, and the
+panel's bands.
+"""
 
 import csv
 import json
@@ -109,7 +111,9 @@ def test_an_outcome_depends_on_its_values_alone_here_and_on_a_cluster(problem, c
 
 
 def test_bands_and_indices_are_those_of_a_known_function():
-    """y = a + 4 b + 0 c over uniform parameters where the press is deepest, and 2 a + 0 b + c before: additive variances."""
+    """y = a + 4 b + 0 c over uniform parameters where the press is deepest, and 2 a + 0 b + c before:
+    additive variances.
+    """
     unknowns = [Unknown(name, "", 0.0, 0.5, 1.0, is_ratio=False) for name in "abc"]
     values = samples_of(unknowns, 256)
     assert len(values) == count_of(unknowns, 256) == 256 * 5
@@ -136,7 +140,9 @@ def test_bands_and_indices_are_those_of_a_known_function():
 
 
 def test_the_band_of_the_position_is_the_distance_from_the_median_place():
-    """Places u^2 along a line of 10 mm, u evenly in 0 to 1: their median is at a quarter, their mean at a third."""
+    """Places u^2 along a line of 10 mm, u evenly in 0 to 1: their median is at a quarter, their mean at a
+    third.
+    """
     u, along = np.linspace(0, 1, 20_001), 10 * np.array([2.0, -1.0, 2.0]) / 3
     outcomes = np.zeros((len(u), 1, len(QUANTITIES) + 3))
     outcomes[:, 0, len(QUANTITIES) :] = (u**2)[:, None] * along + [3.0, 40.0, -7.0]

@@ -1,4 +1,6 @@
-"""The pulse of an array of 75 % bandwidth, by sums over its spectrum: one cycle through a generalized normal window."""
+"""The pulse of an array of 75 % bandwidth, by sums over its spectrum: one cycle through a generalized
+normal window.
+"""
 
 import numpy as np
 
@@ -13,7 +15,9 @@ def spectrum(frequency_mhz: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def loss_db(path_db_mhz: np.ndarray, frequency_mhz: float, of: str = "speckle") -> np.ndarray:
-    """What attenuation [dB/MHz, round trip] takes of the mean square of speckle, or of the peak of an "echo"."""
+    """What attenuation [dB/MHz, round trip] takes of the mean square of speckle, or of the peak of an
+    "echo".
+    """
     frequency, amplitude = spectrum(frequency_mhz)
     path = np.atleast_1d(path_db_mhz)
     power = 2 if of == "speckle" else 1

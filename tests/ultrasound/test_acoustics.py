@@ -1,4 +1,6 @@
-"""What sound meets in voxels: HU by the published fits, labels before HU, the table's values, texture, and what HU vary within a tissue."""
+"""What sound meets in voxels: HU by the published fits, labels before HU, the table's values, texture, and
+what HU vary within a tissue.
+"""
 
 import numpy as np
 import pytest
@@ -64,7 +66,8 @@ def expected(tissue: str) -> list[float]:
     ],
 )
 def test_impedance_is_that_of_the_density_by_schneider_and_the_speed_by_mast(hu, density):
-    # By hand, a piece each: 1.02579 * 900 - 5.680; 0.90827 * 1000 + 103.615; the same at 1030; 0.51084 * 1150 + 539.998;
+    # By hand, a piece each: 1.02579 * 900 - 5.680; 0.90827 * 1000 + 103.615; the same at 1030; 0.51084 * 1150
+    # + 539.998;
     # 0.66254 * 1700 + 348.856; nothing is lighter than air. The coefficients have six figures here.
     speed = (density + 349) / 0.893
     assert float(impedance_of_hu(hu)) == pytest.approx(density * speed * 1e-6, rel=2e-5)
@@ -222,7 +225,8 @@ def test_every_tissue_has_sane_values(tissue):
     table = tissue_table()[tissue]
     keys = {"impedance_mrayl", "attenuation_db_cm_mhz", "backscatter_db", "texture_db", "texture_mm"}
     assert set(table) - {"anisotropy_db", "follows_hu"} == keys and 0 <= table.get("anisotropy_db", 0) < 6
-    # From fat to cortical bone, or titanium, from water to what nothing passes; and no echo above all of the sound.
+    # From fat to cortical bone, or titanium, from water to what nothing passes; and no echo above all of the
+    # sound.
     assert (0.0 if tissue == "gas" else 1.3) < table["impedance_mrayl"] < (
         28.0 if tissue == "metal" else 8.0
     ) and 0 < table["attenuation_db_cm_mhz"] <= 12.0
@@ -255,12 +259,14 @@ def test_backscatter_has_the_tables_level_and_texture(tissue):
     # Some 200 patches, of which the mean is an SD of 0.07 off that of texture.
     level = table["backscatter_db"] + CORTEX_DB
     assert decibel.mean() == pytest.approx(level, abs=0.01 + 0.2 * table["texture_db"])
-    # Of patches of SD s voxels, cut at 2 SD (0.88 s), the smoothing by 0.5 voxels takes 1 - (1 + (0.5 / 0.88 s)^2)^-0.75.
+    # Of patches of SD s voxels, cut at 2 SD (0.88 s), the smoothing by 0.5 voxels takes 1 - (1 + (0.5 / 0.88
+    # s)^2)^-0.75.
     patch = table["texture_mm"] / 2 / spacing
     kept = (1 + (0.5 / (0.88 * patch)) ** 2) ** -0.75
     assert decibel.std() == pytest.approx(kept * table["texture_db"], rel=0.03, abs=1e-4)
     if table["texture_db"]:
-        # Noise through a Gaussian of half the distance correlates by exp(-1) over it, here with 0.07 of sampling.
+        # Noise through a Gaussian of half the distance correlates by exp(-1) over it, here with 0.07 of
+        # sampling.
         lag, off = round(table["texture_mm"] / spacing), decibel - decibel.mean()
         along = np.mean([(np.roll(off, lag, axis) * off).mean() for axis in range(3)]) / off.var()
         assert along == pytest.approx(np.exp(-1), abs=0.15)
@@ -272,7 +278,9 @@ DARKER = ["sinus"]
 
 
 def variation(hu: np.ndarray, tissue: str = "kidney", spacing_mm: float = 1.0) -> np.ndarray:
-    """How the level [dB] of a tissue varies with HU: against the same voxels, and so the same texture, of even HU."""
+    """How the level [dB] of a tissue varies with HU: against the same voxels, and so the same texture, of
+    even HU.
+    """
     labels, spacing = np.ones(hu.shape, np.uint8), np.full(3, spacing_mm)
     varied, even = (
         properties(each.astype(np.float32), labels, {1: tissue}, spacing) for each in (hu, 0 * hu + 40)
@@ -331,11 +339,12 @@ def test_noise_of_a_ct_does_not_become_texture(spacing):
     shape, sd_hu = (72, 72, 72), 12.0
     noise = np.random.default_rng(4).normal(40, sd_hu, shape)
     found = variation(noise, spacing_mm=spacing)[8:-8, 8:-8, 8:-8].std()
-    # White noise through a kernel keeps its SD times the root of the sum of the kernel's squares; along each axis the kernel is two Gaussians,
-    # that of HU and that of the level, one after the other.
+    # White noise through a kernel keeps its SD times the root of the sum of the kernel's squares; along each
+    # axis the kernel is two Gaussians, that of HU and that of the level, one after the other.
     kernel = np.convolve(gaussian(OF_HU_MM / spacing, 2.0), gaussian(LEVEL_SMOOTHING_VOXELS, 2.5))
     wanted = DB_OF_HU * sd_hu * (kernel**2).sum() ** 1.5
-    # Of 56^3 voxels some 56^3 / (2 sqrt(pi) s)^3 are independent: at least 500, of which the SD is known to 1 / sqrt(1000).
+    # Of 56^3 voxels some 56^3 / (2 sqrt(pi) s)^3 are independent: at least 500, of which the SD is known to 1
+    # / sqrt(1000).
     assert found == pytest.approx(wanted, rel=0.08)
     # Less than a third of the texture of parenchyma.
     assert found < 0.35 * tissue_table()["kidney"]["texture_db"]

@@ -22,7 +22,9 @@ def over(x: float = 0.0, y: float = 0.0, height: float = TOP, length: float = 20
 
 
 def tilted(degrees: float) -> np.ndarray:
-    """Pose over the top's middle, turned about y, whose lower edge (at x > 0 for positive angles) is on the top."""
+    """Pose over the top's middle, turned about y, whose lower edge (at x > 0 for positive angles) is on
+    the top.
+    """
     pose = np.eye(4)
     pose[:3, :3] = rotation_about([0, 1, 0], degrees)
     edge = pose[:3, :3] @ [np.sign(degrees) * SIZE[0] / 2, 0, -SIZE[2] / 2]
@@ -38,7 +40,8 @@ def pressed(pose, now, mesh, size=SIZE, radius=0.0):
 
 @pytest.mark.parametrize("x, y, wide, high", [(0, 0, 15, 7.5), (6, 7.75, 13.5, 6), (-6, -7.75, 13.5, 6)])
 def test_a_flat_face_on_a_flat_top_touches_where_they_overlap(block, x, y, wide, high):
-    # The edges of the block run between places, so that none is cut; whether its faces are large or small, from whichever corner.
+    # The edges of the block run between places, so that none is cut; whether its faces are large or small,
+    # from whichever corner.
     small = block.subdivide().subdivide().subdivide()
     turned = [
         trimesh.Trimesh(small.vertices, np.roll(small.faces, n, axis=1), process=False) for n in range(3)
@@ -72,7 +75,8 @@ def test_a_tilted_face_touches_in_a_strip_along_its_lower_edge(block, degrees):
 
 
 def test_a_curved_face_touches_over_the_chord_of_its_sagitta(block):
-    # Its middle touches; a chord c lies CONTACT_MM behind the middle where c^2 = 2 r s - s^2. Places are off by half of one a side.
+    # Its middle touches; a chord c lies CONTACT_MM behind the middle where c^2 = 2 r s - s^2. Places are off
+    # by half of one a side.
     half = np.sqrt(2 * RADIUS * CONTACT_MM - CONTACT_MM**2)
     arc = RADIUS * np.arcsin(half / RADIUS)
     at = over(length=CURVED[2])
@@ -85,7 +89,8 @@ def test_a_curved_face_touches_over_the_chord_of_its_sagitta(block):
 def test_the_points_of_a_curved_face_lie_on_it_and_stand_for_all_of_it():
     points, area = face_points(CURVED, RADIUS)
     assert np.hypot(points[:, 0], points[:, 2] + CURVED[2] / 2 - RADIUS) == pytest.approx(RADIUS)
-    # The midpoint rule on 88 places of 1 / sqrt(1 - x^2 / r^2), whose second derivative is less than 10 / r^2 here.
+    # The midpoint rule on 88 places of 1 / sqrt(1 - x^2 / r^2), whose second derivative is less than 10 / r^2
+    # here.
     whole = 2 * RADIUS * np.arcsin(33 / RADIUS) * CURVED[1]
     assert area.sum() == pytest.approx(whole, rel=CELL**2 * 10 / RADIUS**2 / 24)
 
@@ -105,10 +110,12 @@ def test_a_block_squeezed_is_shorter_by_what_it_lost(block):
 def test_a_ball_squeezed_and_sheared_is_shorter_along_its_longest_chord(ball, shear):
     map_ = np.array([[1.1, 0, shear], [0, 1.05, 0], [0, 0, 0.8]])
     back = np.linalg.inv(map_)
-    # A chord along z now was longer by this; the longest goes through the middle, 12 mm of radius both ways at rest.
+    # A chord along z now was longer by this; the longest goes through the middle, 12 mm of radius both ways
+    # at rest.
     longer = np.linalg.norm(back[:, 2])
     most = 2 * 12 * (1 - 1 / longer)
-    # Facets lie between the ball and one that they all touch; the nearest place is half a cell's diagonal from the middle.
+    # Facets lie between the ball and one that they all touch; the nearest place is half a cell's diagonal
+    # from the middle.
     inner = np.abs(np.einsum("ij,ij->i", ball.triangles_center, ball.face_normals)).min()
     aside = CELL / np.sqrt(2) * np.linalg.norm(back, 2)
     least = 2 * np.sqrt(inner**2 - aside**2) * (1 - 1 / longer)

@@ -31,8 +31,9 @@ def middle(probe: Probe) -> float:
 @pytest.mark.parametrize("name", ["drop-in", "linear"])
 def test_at_the_focus_the_beam_is_the_square_of_a_sinc(name):
     probe = load_probe(name)
-    # sinc^2(w D / (2 wavelength F)) is half at 0.886 wavelengths times f-number. Elements radiate less to the side, which makes the
-    # aperture a little smaller; the mean over the pulse's frequencies is wider by some per cent.
+    # sinc^2(w D / (2 wavelength F)) is half at 0.886 wavelengths times f-number. Elements radiate less to the
+    # side, which makes the aperture a little smaller; the mean over the pulse's frequencies is wider by some
+    # per cent.
     wanted = 0.886 * probe.wavelength_mm * probe.f_number
     assert width_mm(probe, middle(probe), probe.focus_mm) == pytest.approx(wanted, rel=0.1)
 
@@ -89,7 +90,8 @@ def test_across_the_plane_the_beam_at_the_lens_focus_is_the_square_of_a_sinc(nam
     focus, height = probe.elevation_focus_mm, probe.element_height_mm
     thickness, correlation = elevation_profiles(probe, np.array([focus, 1.8 * focus]))
     wanted = 0.886 * probe.wavelength_mm * focus / height
-    # sinc^2 correlates with itself as (its transform, a triangle, squared): intensity by half at 0.414 of the same unit.
+    # sinc^2 correlates with itself as (its transform, a triangle, squared): intensity by half at 0.414 of the
+    # same unit.
     assert thickness[0] * FWHM_OF_SD == pytest.approx(wanted, rel=0.1)
     shift = np.linspace(0, 1, 1001)
     frequency = np.linspace(-1, 1, 2001)

@@ -1,4 +1,6 @@
-"""Blood flow at voxels: along drawn vessels, from and to the kidney by their kind, with a parabolic profile."""
+"""Blood flow at voxels: along drawn vessels, from and to the kidney by their kind, with a parabolic
+profile.
+"""
 
 import numpy as np
 import pytest
@@ -21,7 +23,9 @@ TISSUES = {1: "kidney", 2: "artery", 3: "vein", 4: "vessel", 5: "necrosis", 6: "
 
 
 def drawn(value: int, bend: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Labels of a kidney beyond x = 48 mm, which a tube along x enters; and the distance from the tube's centreline [mm]."""
+    """Labels of a kidney beyond x = 48 mm, which a tube along x enters; and the distance from the tube's
+    centreline [mm].
+    """
     x, y, z = SPACING[:, None, None, None] * np.indices(SHAPE)
     off = np.hypot(y - 16.0 - bend * np.sin(x / 10), z - 16.0)
     labels = np.where(x > 48.0, 1, 0)
@@ -55,7 +59,9 @@ def test_blood_flows_to_the_kidney_in_arteries_and_from_it_in_veins(value, kind,
 
 @pytest.mark.parametrize("kind, sign", [("artery", 1), ("vein", -1)])
 def test_the_volume_of_flow_is_along_the_vessel_in_thick_oblique_slices(device, kind, sign):
-    """A straight vessel of 16 mm into a kidney, off the origin; where it flows and whither, in the patient."""
+    """A straight vessel of 16 mm into a kidney, off the origin; where it flows and whither, in the
+    patient.
+    """
     mm_from_index = np.eye(4)
     mm_from_index[:3, :3] = rotation_about([1, 2, 3], 40) * [0.9, 1.4, 5.0]
     shape, begin, along = (110, 80, 24), np.array([60.0, -40.0, 110.0]), np.array([0.48, 0.64, 0.6])
@@ -77,8 +83,10 @@ def test_the_volume_of_flow_is_along_the_vessel_in_thick_oblique_slices(device, 
     mean = values[tuple(middle.T)][:, :3].mean(axis=0)
     # Both ends of the vessel are half a slice off at most: over its length of 36 mm that is 2 atan(2.5 / 36).
     assert sign * mean @ along > np.cos(2 * np.arctan(2.5 / 36)) * np.linalg.norm(mean)
-    # Faster towards the middle: the distance from the wall is right to half a millimetre in the mean of a ring, where the profile's slope is
-    # 2 / 8 a millimetre at most. The widest distance is that of the middle of a voxel, 2.4 mm wide in the mean.
+    # Faster towards the middle: the distance from the wall is right to half a millimetre in the mean of a
+    # ring, where the profile's slope is
+    # 2 / 8 a millimetre at most. The widest distance is that of the middle of a voxel, 2.4 mm wide in the
+    # mean.
     at = middle @ np.linalg.inv(from_mm)[:3, :3].T + np.linalg.inv(from_mm)[:3, 3] - begin
     away = np.linalg.norm(at - np.outer(at @ along, along), axis=1)
     speed = np.linalg.norm(values[tuple(middle.T)][:, :3], axis=1)

@@ -63,7 +63,8 @@ def depths(probe: Probe) -> np.ndarray:
 class Tank:
     """Tissue that a probe looks into along y, filled anew for each test: so kernels are compiled but once.
 
-    ``voxel_mm`` and ``count`` are of the axes, ``low_mm`` is the first voxel's centre; ``organ`` None is all there is.
+    ``voxel_mm`` and ``count`` are of the axes, ``low_mm`` is the first voxel's centre; ``organ`` None is all
+    there is.
     """
 
     def __init__(self, voxel_mm, count, low_mm, embedding=None, organ=None, contact="tissue") -> None:
@@ -139,7 +140,9 @@ def interface(before: float, behind: float, blur_mm: float, tilt_deg: float = 0.
 
 
 def peaks(decibel: np.ndarray, probe: Probe) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth [mm], amplitude and SD [mm] of each line's highest echo: a Gaussian is a parabola in dB, three samples tell it."""
+    """Depth [mm], amplitude and SD [mm] of each line's highest echo: a Gaussian is a parabola in dB, three
+    samples tell it.
+    """
     i = np.clip(decibel.argmax(axis=1), 1, SAMPLES - 2)
     before, top, behind = (np.take_along_axis(decibel, i[:, None] + k, axis=1)[:, 0] for k in (-1, 0, 1))
     curve = before - 2 * top + behind
@@ -179,8 +182,8 @@ def test_attenuation_that_grows_with_depth_is_integrated_along_the_beam(fine):
     lost = lossless - fine.look(probe)
     wanted = loss_db(0.2 * 0.03 / 2 * (depths(probe) * speed_ratio(TISSUE)) ** 2, 5.0)
     deep = (wanted > 20) & (wanted < 110)
-    # A trapezoid is exact here; by the attenuation at its end each step would take 0.4 dB more in all. The deepest step loses 1.5 dB: between
-    # its ends amplitude is a chord, 0.03 dB above the exponential.
+    # A trapezoid is exact here; by the attenuation at its end each step would take 0.4 dB more in all. The
+    # deepest step loses 1.5 dB: between its ends amplitude is a chord, 0.03 dB above the exponential.
     assert deep.any() and np.abs(lost - wanted)[:, deep].max() < 0.03
 
 
@@ -205,7 +208,9 @@ def test_attenuated_speckle_keeps_its_mean_square_and_becomes_longer(fine, detai
 
 
 def test_speckle_longer_than_the_longest_kernel_keeps_its_mean_square(fine):
-    """Samples of 0.03 mm, and a loss that makes the pulse longer by more than 4 of them: no kernel is longer."""
+    """Samples of 0.03 mm, and a loss that makes the pulse longer by more than 4 of them: no kernel is
+    longer.
+    """
     probe, attenuation = probe_of(frequency_mhz=3.0, depth_mm=20.0), 3.0
     fine.fill(backscatter=0.1)
     whole = fine.look(probe, "speckle")
@@ -233,11 +238,13 @@ def test_the_echo_of_an_interface_has_its_reflection_and_depth(request, size, ti
     for depth in (39.7, 40.0, 40.3):
         tank.fill(interface(FAT, TISSUE, blur, tilt, depth))
         found, amplitude, width = (each[lines] for each in peaks(tank.look(probe), probe))
-        # Looks that differ by less than 3e-4 are no part of it: of a Gaussian's flanks, where the next differs by less than
-        # half as much, 6e-4 each of 0.08. Slopes of trilinear voxels point half a degree off, of 9.5.
+        # Looks that differ by less than 3e-4 are no part of it: of a Gaussian's flanks, where the next
+        # differs by less than half as much, 6e-4 each of 0.08. Slopes of trilinear voxels point half a degree
+        # off, of 9.5.
         assert amplitude == pytest.approx(REFLECTION * share, abs=REFLECTION * (0.06 if tilt else 0.015))
-        # Impedance steps by more, relatively, where it is lower: a Gaussian's middle comes R SD / sqrt(pi) nearer, and a
-        # voxel widens it by 1 / sqrt(6). One line is off by up to an SD of the pulse, square to the interface.
+        # Impedance steps by more, relatively, where it is lower: a Gaussian's middle comes R SD / sqrt(pi)
+        # nearer, and a voxel widens it by 1 / sqrt(6). One line is off by up to an SD of the pulse, square to
+        # the interface.
         nearer = REFLECTION * np.hypot(blur, tank.voxel_mm / np.sqrt(6)) / np.sqrt(np.pi) / cosine
         off = found * speed_ratio(FAT) - depth + u[lines] * np.tan(np.radians(tilt)) + nearer
         assert abs(off.mean()) < 0.03 and np.abs(off).max() < 1.5 * probe.axial_sd_mm / cosine
@@ -272,7 +279,8 @@ def test_a_rough_interface_is_seen_aslant(fine, tilt):
     fine.fill(interface(FAT, TISSUE, 0.4, tilt))
     _, amplitude, _ = peaks(fine.look(probe), probe)
     fine.bmode.sound.surface = MIRROR
-    # Rays of the aperture, scattered around the mirror's direction by twice the slope in both axes, counted where they return.
+    # Rays of the aperture, scattered around the mirror's direction by twice the slope in both axes, counted
+    # where they return.
     draw, count = np.random.default_rng(1), 400_000
     along, across = np.arctan(1 / (2 * probe.f_number)), np.arctan(probe.element_height_mm / 2 / 25.0)
     back = 2 * np.radians(tilt) + draw.uniform(-along, along, count) + draw.normal(0, 0.28, count)
@@ -294,7 +302,8 @@ def test_the_echo_of_a_rough_interface_is_attenuated_too(fine):
         fine.fill(interface(FAT, TISSUE, 0.4), attenuation)
         echoes.append(fine.look(probe, "speckle")[:, 280:360].max(axis=1))
     fine.bmode.sound.surface = MIRROR
-    # So rough that none of it is a mirror's: the echo is speckle, which attenuation leaves as it is, but for a longer pulse.
+    # So rough that none of it is a mirror's: the echo is speckle, which attenuation leaves as it is, but for
+    # a longer pulse.
     assert echoes[0].std() > 3.0
     lost = loss_db(0.2 * 0.5 * 40.0, 5.0, "echo")[0]
     assert (echoes[0] - echoes[1]).mean() == pytest.approx(lost, abs=0.7)
@@ -381,7 +390,8 @@ def test_behind_a_layer_is_the_shadow_of_its_faces_and_of_what_it_takes(fine, wi
     fine.fill(lambda x, y, z: TISSUE + (within - TISSUE) * share(y), lambda x, y, z: more * share(y), 1.0)
     passed = 1 - ((within - TISSUE) / (within + TISSUE)) ** 2
     wanted = 2 * 20 * np.log10(passed) - loss_db(0.2 * more * 4.0, probe.frequency_mhz)[0]
-    # A trapezoid over looks is off by 0.5^2 / 8 of a kink at most, at four; float32 holds gas's 1 - R^2 = 1e-3 to 1e-4, and
+    # A trapezoid over looks is off by 0.5^2 / 8 of a kink at most, at four; float32 holds gas's 1 - R^2 =
+    # 1e-3 to 1e-4, and
     # 1e-9 is 0.01 dB of what is left behind it.
     bound = 0.02 + 0.2 * more * probe.frequency_mhz * 4 * 0.5**2 / 8
     assert np.abs(fine.look(probe)[:, 480:] - wanted).max() < bound
@@ -476,8 +486,10 @@ def test_the_mean_square_of_speckle_is_the_backscatter_squared(endless, geometry
     turns = Rotation.random(12, random_state=5).as_matrix()
     echoes = [endless.look(probe, detail_level, place.uniform(-50, 50, 3), *turn[:2]) for turn in turns]
     squares = (10 ** (np.array(echoes) / 10)).mean(axis=0) / 0.1**2
-    # What the kernel adds up lies 1.4 entries apart in the mean where lines are dense: noise ends at the borders of blocks of
-    # 64, which takes 3 % of it there, and, held over entries, is 5 % short aslant to them. Sampling has an SD of 1 to 3 %.
+    # What the kernel adds up lies 1.4 entries apart in the mean where lines are dense: noise ends at the
+    # borders of blocks of
+    # 64, which takes 3 % of it there, and, held over entries, is 5 % short aslant to them. Sampling has an SD
+    # of 1 to 3 %.
     inner = squares[MAX_HALF_WIDTH:-MAX_HALF_WIDTH]
     assert inner.mean() == pytest.approx(1.0, abs=0.05)
     assert inner.mean(axis=0).reshape(8, -1).mean(axis=1) == pytest.approx(np.ones(8), abs=0.12)
@@ -490,8 +502,9 @@ def test_speckle_correlates_as_the_point_spread_function_does(endless):
     endless.fill(backscatter=0.1)
     places = np.random.default_rng(6).uniform(-50, 50, (8, 3))
     intensity = np.stack([10 ** (endless.look(probe, "speckle", at) / 10) / 0.1**2 - 1 for at in places])
-    # Scatterers of no correlation, seen with a profile: an echo correlates as the profile with itself, an intensity as the square
-    # of that. Noise held over an entry correlates by chords of that, 0.04 off; 3000 cells of its block leave an SD of 0.02.
+    # Scatterers of no correlation, seen with a profile: an echo correlates as the profile with itself, an
+    # intensity as the square of that. Noise held over an entry correlates by chords of that, 0.04 off; 3000
+    # cells of its block leave an SD of 0.02.
     lags, middle = np.arange(-60, 61), (LINES - 1) / 2
     for axis, first, last in ((2, 0, 300), (1, 40, 160), (1, 200, 310), (1, 500, 620)):
         field = np.moveaxis(intensity[..., first:last], axis, 0)
@@ -529,14 +542,17 @@ def test_speckle_decorrelates_across_the_plane_as_the_beam_does(endless, axis, t
         curves.append((frames * frames[0]).mean(axis=(1, 3)) / (frames[0] ** 2).mean(axis=(0, 2)))
     curves = np.mean(curves, axis=0)
     _, sd = elevation_profiles(probe, (np.arange(8) + 0.5) * 5.0)
-    # Six frames of some 100 cells in each part leave an SD of 0.04; where lengths are mixed the curve is a little longer.
+    # Six frames of some 100 cells in each part leave an SD of 0.04; where lengths are mixed the curve is a
+    # little longer.
     wanted = np.exp(-0.5 * (steps[:, None] / sd) ** 2)
     assert np.abs(curves - wanted)[:, 1:].max() < 0.16
     assert np.abs(curves - wanted)[:, 1:].mean(axis=1).max() < 0.07
 
 
 def test_the_decorrelation_of_a_sweep_gives_its_elevational_steps(endless):
-    """Sensorless freehand: the curve is calibrated on one sweep, the steps are those of another, elsewhere."""
+    """Sensorless freehand: the curve is calibrated on one sweep, the steps are those of another,
+    elsewhere.
+    """
     probe = probe_of(depth_mm=40.0, element_height_mm=4.0)
     endless.fill(backscatter=0.1)
 
@@ -593,7 +609,8 @@ def test_tissue_and_probe_moved_alike_give_the_same_picture(moved, elevation):
     move(turn, shift)
     again = tank.look(probe, "speckle", turn @ face + shift, turn @ [0, 1, 0], turn @ [1, 0, 0])
     u, v = np.meshgrid(probe.scanlines()[0][:, 0], depths(probe) - 10.0, indexing="ij")
-    # Places are right to 1e-5 mm, noise is held over 0.06 mm: 5 in 10^4 samples take another entry, and ten lines see each.
+    # Places are right to 1e-5 mm, noise is held over 0.06 mm: 5 in 10^4 samples take another entry, and ten
+    # lines see each.
     assert (np.abs(again - first)[np.hypot(u, v) < 10.5] < 0.01).mean() > 0.99
     assert np.abs(tank.look(probe, "speckle", face) - first).mean() > 3.0
 
@@ -616,12 +633,14 @@ def test_tracked_speckle_moves_as_the_tissue_does(moved, across, along, shear):
         found.append(-phase_cross_correlation(*blocks, upsample_factor=20, normalization=None)[0] * size)
         wanted.append(strain[:2, :2] @ ((at + 0.5) * size - [8, 10]) + shift[:2])
     errors, ways = (np.linalg.norm(each, axis=1) for each in (np.subtract(found, wanted), wanted))
-    # The skin follows an affine map to strain times the way to a cluster's centre, 2 % of 2 mm; the search steps by 0.004 mm.
+    # The skin follows an affine map to strain times the way to a cluster's centre, 2 % of 2 mm; the search
+    # steps by 0.004 mm.
     assert errors.mean() < 0.05 and errors.max() < 0.2 < ways.mean()
 
 
 def test_a_target_off_the_plane_is_dimmed_as_the_thick_plane_weighs_it():
-    # The element is so low that the beam is as thick at every depth as at its focus, nearly; the SD is checked in test_beam_profiles.
+    # The element is so low that the beam is as thick at every depth as at its focus, nearly; the SD is
+    # checked in test_beam_profiles.
     probe = probe_of(element_height_mm=1.5, elevation_focus_mm=40.0)
     tank = Tank((BOUNDLESS, BOUNDLESS, 0.05), (1, 1, 641), (0, 0, -16.0))
     tank.fill(backscatter=0.1)
@@ -634,7 +653,8 @@ def test_a_target_off_the_plane_is_dimmed_as_the_thick_plane_weighs_it():
         def target(z):
             return 1e-4 + 0.5 * np.exp(-0.5 * ((z / thickness - off) / 0.5) ** 2)
 
-        # Gauss-Hermite with three nodes, of the beam's energy: an SD of the amplitude over sqrt(2), times sqrt(3).
+        # Gauss-Hermite with three nodes, of the beam's energy: an SD of the amplitude over sqrt(2), times
+        # sqrt(3).
         node = thickness * np.sqrt(1.5)
         weighed = np.sqrt(2 / 3 * target(0.0) ** 2 + (target(node) ** 2 + target(-node) ** 2) / 6)
         tank.fill(backscatter=lambda x, y, z: target(z))
@@ -648,7 +668,8 @@ def test_the_incidence_angle_is_that_in_deformed_tissue(moved):
     # A shear that turns the planes y = const by 5 degrees.
     move(np.array([[1, 0, 0], [np.tan(np.radians(5.0)), 1, 0], [0, 0, 1]]), np.zeros(3))
     _, amplitude, _ = peaks(tank.look(probe, at=(0.0, -10.0, 0.4)), probe)
-    # The skin follows the shear to a degree or two, in each tetrahedron in its own way: the interface is where its map says.
+    # The skin follows the shear to a degree or two, in each tetrahedron in its own way: the interface is
+    # where its map says.
     u, pixel = probe.scanlines()[0][80:112, 0], np.array([16.0, 20.0]) / PIXELS
     column, row = (np.rint([u, np.full(32, 11.0)] / pixel[:, None] + [[PIXELS / 2], [0]] - 0.5)).astype(int)
     maps = array_of(tank.plane.embedding.rest_from_plane)[array_of(tank.plane.owner)[row, column]]
@@ -707,7 +728,9 @@ def test_tubules_are_bright_where_the_beam_meets_them_squarely():
 
 @pytest.mark.parametrize("inside", [1.50, 1.66])
 def test_refraction_by_a_cylinder_moves_sound_together_or_apart(fine, inside):
-    """Parallel rays through a cylinder of 7 mm, Snell's law at both faces, and their distances over a Fresnel zone 20 mm behind it."""
+    """Parallel rays through a cylinder of 7 mm, Snell's law at both faces, and their distances over a
+    Fresnel zone 20 mm behind it.
+    """
     outside, radius, y0, probe = 1.5804, 7.0, 15.0, probe_of(f_number=20.0)
     edge = 0.4
 

@@ -1,4 +1,6 @@
-"""The echo of the renal capsule: a line at the surface of parenchyma where no step of impedance is, by the angle of the beam."""
+"""The echo of the renal capsule: a line at the surface of parenchyma where no step of impedance is, by the
+angle of the beam.
+"""
 
 import numpy as np
 import pytest
@@ -10,7 +12,8 @@ from ultrasound.acoustics import CORTEX_DB, acoustic_values
 from ultrasound.propagation import CAPSULE, CAPSULE_TILT
 from ultrasound.sampled_volume import SampledVolume
 
-# Of a ball, whose top is 20 mm below the face of the probe; backscatter of cortex, and its anisotropy, which tells parenchyma.
+# Of a ball, whose top is 20 mm below the face of the probe; backscatter of cortex, and its anisotropy, which
+# tells parenchyma.
 RADIUS, TOP, CORTEX, PARENCHYMA = 25.0, 20.0, 10 ** (CORTEX_DB / 20), 3.0
 VOXEL = 1.0
 ORGAN_LOW = np.array([-45.0, TOP + RADIUS - 45.0, -45.0])
@@ -62,10 +65,12 @@ def test_a_line_is_at_the_surface_where_no_step_of_impedance_is(tank):
     found, amplitude = top_echo(tank.look(probe), probe)
     u = probe.scanlines()[0][:, 0]
     near = np.abs(u) < 6.0
-    # Halfway between samples distances are linear; a chord of the ball over a voxel is VOXEL^2 / (8 RADIUS) off.
+    # Halfway between samples distances are linear; a chord of the ball over a voxel is VOXEL^2 / (8 RADIUS)
+    # off.
     surface = TOP + RADIUS - np.sqrt(RADIUS**2 - u**2)
     assert np.abs(found - surface)[near].max() < probe.sample_mm + VOXEL**2 / 4 / RADIUS + 0.05
-    # By the angle between beam and surface, of which the ball's normal is u / R aside; a mirror's and a diffuse part have one energy.
+    # By the angle between beam and surface, of which the ball's normal is u / R aside; a mirror's and a
+    # diffuse part have one energy.
     wanted = CAPSULE * np.exp(-0.5 * (np.arcsin(np.abs(u) / RADIUS) / CAPSULE_TILT) ** 2)
     # Slopes of trilinear voxels point a degree off, at the steepest flank 0.61 / CAPSULE_TILT of it.
     wide = np.abs(u) < 8.0

@@ -70,7 +70,8 @@ def test_a_plane_shows_a_slab_of_its_thickness(organ, axes, thickness):
     edge = 0.3 + VOXEL_MM * np.sqrt(3) / 2 * np.linalg.norm(np.linalg.inv(axes), 2)
     aside = np.maximum(np.abs(u) - 20, np.abs(v - 25) - 25)
     assert not organ.seen[(np.abs(off) > thickness / 2 + reach) | (aside > edge)].any()
-    # A middle in the slab is half a step of the parts from one of theirs, along each axis: nearer than half a voxel.
+    # A middle in the slab is half a step of the parts from one of theirs, along each axis: nearer than half a
+    # voxel.
     parts = np.ceil(thickness / VOXEL_MM)
     steps = [
         *np.linalg.norm(axes[:, :2], axis=0) * [40 / (GRID_POINTS - 1), 50 / (GRID_POINTS - 1)],
@@ -82,7 +83,8 @@ def test_a_plane_shows_a_slab_of_its_thickness(organ, axes, thickness):
     assert organ.seen[inside].mean() > 0.97
     if np.array_equal(axes, UPRIGHT):
         return  # which has whole layers of voxels
-    # So of the ball between a slab and one thicker by a voxel's extent less a part's step; counting is off by 3 %.
+    # So of the ball between a slab and one thicker by a voxel's extent less a part's step; counting is off by
+    # 3 %.
     height, inner = np.dot(normal, origin), (aside < 0) & organ.targets["organ"]
     share = (
         inner[np.abs(off) < thickness / 2].sum() / organ.targets["organ"][np.abs(off) < thickness / 2].sum()
@@ -106,7 +108,8 @@ def test_on_average_a_plane_along_the_voxels_is_as_thick_as_it_is(organ, thickne
         organ.clear()
         organ.add(places(probe, UPRIGHT, (0, y, 22)), probe, None)
         volumes.append((organ.seen & organ.targets["organ"]).sum() * VOXEL_MM**3)
-    # Parts of equal thickness, each in the voxel of its middle; one voxel at least. Facets take 1.2 %, and counting.
+    # Parts of equal thickness, each in the voxel of its middle; one voxel at least. Facets take 1.2 %, and
+    # counting.
     parts = np.ceil(thickness / VOXEL_MM)
     assert np.mean(volumes) == pytest.approx(slab(thickness - thickness / parts + VOXEL_MM, 0.0), rel=0.02)
 
@@ -116,8 +119,10 @@ def test_scanlines_without_contact_add_nothing(organ, shift):
     organ.clear()
     touches = organ.add(places(PROBE, UPRIGHT, (shift, 0, R)), PROBE, 1.5)
     x = PROBE.elements()[:, 0] + shift
-    # The face lies in a tangent plane: an element at x is hypot(x, R) - R from the ball. That is known to what facets
-    # (0.4 % of the radius) and voxels (VOXEL^2 / 8 of the curvatures 2 / R) leave, at the nearest of places 0.42 mm apart.
+    # The face lies in a tangent plane: an element at x is hypot(x, R) - R from the ball. That is known to
+    # what facets
+    # (0.4 % of the radius) and voxels (VOXEL^2 / 8 of the curvatures 2 / R) leave, at the nearest of places
+    # 0.42 mm apart.
     gap = np.hypot(x, R) - R
     known = np.abs(gap - 1.5) > 0.004 * R + VOXEL_MM**2 / 8 * 2 / R + 0.21
     assert known.mean() > 0.8
@@ -137,7 +142,8 @@ def test_the_first_and_last_places_stand_for_as_much_as_the_others(organ):
     few = np.linspace(0, GRID_POINTS - 1, count).astype(int)
     organ.add(places(probe, UPRIGHT, (0, 0, 18))[np.ix_(few, few)], probe, None)
     u, v, _ = on_picture(organ, UPRIGHT, (0, 0, 18))
-    # Half a place beyond the ends, less half of a part: of those there is one a voxel where tissue is squeezed by 0.7.
+    # Half a place beyond the ends, less half of a part: of those there is one a voxel where tissue is
+    # squeezed by 0.7.
     spacing = 36.0 / (count - 1)
     beyond = spacing / 2 * (1 - 1 / np.ceil(spacing / 0.7 / VOXEL_MM))
     ends = [u[organ.seen].min() + 18, v[organ.seen].min(), v[organ.seen].max() - 36]
@@ -215,7 +221,8 @@ def test_what_was_not_imaged_is_the_gap(organ, first, last):
         # The edge lies half a voxel off at most; facets take 1.2 % of a volume.
         off = VOXEL_MM / 2 * np.pi * (R**2 - edge**2) / 1000
         assert gap.volume_ml == pytest.approx(volume, abs=off + 0.012 * volume)
-        # The largest ball in a cap has its height across; of layers, a voxel more or less, the even number at or above is told.
+        # The largest ball in a cap has its height across; of layers, a voxel more or less, the even number at
+        # or above is told.
         height = R - sides[edge] * edge
         assert height - VOXEL_MM <= gap.thickness_mm <= height + 2 * VOXEL_MM
     missing = sum(caps) / (4 / 3 * np.pi * R**3 / 1000)

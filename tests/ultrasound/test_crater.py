@@ -1,4 +1,6 @@
-"""A crater in volumes at rest: its HU, acoustic values and distances inside and outside, and what was there before."""
+"""A crater in volumes at rest: its HU, acoustic values and distances inside and outside, and what was
+there before.
+"""
 
 from dataclasses import replace
 
@@ -16,7 +18,8 @@ from ultrasound.sampled_volume import AIR_HU, SampledVolume
 RADIUS, VOXEL_MM = 9.0, 1.5
 MIDDLE = np.array([4.0, -2.0, 3.0])
 SURFACE = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS).apply_translation(MIDDLE)
-# How far the mesh is inside the ball, and the error of distances between the points of the crater's grid: h^2 / 8 times two curvatures.
+# How far the mesh is inside the ball, and the error of distances between the points of the crater's grid: h^2
+# / 8 times two curvatures.
 INSET = RADIUS - np.linalg.norm(SURFACE.triangles_center - MIDDLE, axis=1).min()
 
 
@@ -59,8 +62,8 @@ def test_it_has_the_hu_of_what_fills_it(device, from_surface, filling, hu):
     assert (from_surface < -half).sum() > 300
     assert after[from_surface < -half - WITHIN] == pytest.approx(hu, abs=1e-4)
     np.testing.assert_array_equal(after[from_surface > half + WITHIN], random[from_surface > half + WITHIN])
-    # Between, each voxel changes by the share of its width that is inside: the shares sum to the ball's volume. A linear share is exact
-    # for a plane; the ball's curvature adds 4 pi h^2 r / 12.
+    # Between, each voxel changes by the share of its width that is inside: the shares sum to the ball's
+    # volume. A linear share is exact for a plane; the ball's curvature adds 4 pi h^2 r / 12.
     share = ((after - random) / (hu - random)).sum() * VOXEL_MM**3
     curved = 4 * np.pi * RADIUS * VOXEL_MM**2 / 12
     sampled = 4 * np.pi * RADIUS**2 * INSET

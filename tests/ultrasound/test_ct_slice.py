@@ -158,8 +158,9 @@ def test_under_an_affine_deformation_it_is_the_pull_back_within_the_skins_error(
     cut, plane, model, embedding = sliced(kept, ball, ramp_image, lambda x: x @ shear.T + shift)
     wanted = ((pixel_points(plane, 96) - shift) @ np.linalg.inv(shear).T) @ GRADIENT
     inside = organ_mask(cut)
-    # A vertex at X goes to R X + (F - R) c, with c the weighted mean of its clusters' centres, instead of to F X: it
-    # is off by (F - R)(X - c). Pulled back, that is an error of F^-1 (F - R)(X - c) at most, in any tetrahedron.
+    # A vertex at X goes to R X + (F - R) c, with c the weighted mean of its clusters' centres, instead of to
+    # F X: it is off by (F - R)(X - c). Pulled back, that is an error of F^-1 (F - R)(X - c) at most, in any
+    # tetrahedron.
     u, _, vt = np.linalg.svd(shear)
     skin = embedding.skin
     centre = np.einsum("vk,vkj->vj", array_of(skin.weight), model.rest_centres[array_of(skin.frame)])
@@ -184,7 +185,8 @@ def bent(x: np.ndarray) -> np.ndarray:
     return x + 0.03 * x[:, [1, 2, 0]] ** 2
 
 
-# Of few pixels some that are drawn together are in the organ and others beyond all tissue; 20 are no multiple of those.
+# Of few pixels some that are drawn together are in the organ and others beyond all tissue; 20 are no multiple
+# of those.
 @pytest.mark.parametrize("pixels, outside", [(96, "background"), (20, "gel")])
 def test_pixels_drawn_together_show_what_each_shows_alone(kept, ball, pixels, outside):
     cut, _, _, _ = sliced(kept, ball, ramp_image, bent, pixels, outside)
@@ -275,7 +277,8 @@ def test_fewer_pixels_are_in_the_tetrahedra_of_the_places_that_they_show(kept, b
     found = array_of(cut.plane.owner)[: shape[0], : shape[1]]
     # Rounding decides on what is between two tetrahedra.
     assert (found != owner[middle]).mean() < 0.002 and (found < embedding.count).mean() > 0.2
-    # Places that are measured stay where they are; a map continues up to 0.4 mm beyond its tetrahedron, which is bent by 0.1 per mm.
+    # Places that are measured stay where they are; a map continues up to 0.4 mm beyond its tetrahedron, which
+    # is bent by 0.1 per mm.
     inside = owner < embedding.count
     assert np.abs(cut.plane.rest_grid(96) - rest)[inside].mean() < 0.02
     assert np.abs(cut.plane.rest_grid(96) - rest)[middle][inside[middle]].max() < 1e-3

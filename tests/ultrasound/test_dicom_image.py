@@ -20,7 +20,8 @@ from version import VERSION
 PICTURE = np.random.default_rng(3).integers(0, 256, (9, 7), np.uint8)
 SPACING_MM = (62.4 / 529, 1 / 3)
 
-# Types 1 and 2, and 1C and 2C where their condition holds, of the mandatory modules and of the calibration: PS3.3 (2024d).
+# Types 1 and 2, and 1C and 2C where their condition holds, of the mandatory modules and of the calibration:
+# PS3.3 (2024d).
 REQUIRED = {
     "Patient, C.7.1.1": ("DeidentificationMethod", "PatientName PatientID PatientBirthDate PatientSex"),
     "General Study, C.7.2.1": (
@@ -31,7 +32,8 @@ REQUIRED = {
     "General Equipment, C.7.5.1": ("", "Manufacturer"),
     "General Image, C.7.6.1": ("", "InstanceNumber PatientOrientation"),
     "Image Pixel, C.7.6.3": (
-        "SamplesPerPixel PhotometricInterpretation Rows Columns BitsAllocated BitsStored HighBit PixelRepresentation PixelData",
+        "SamplesPerPixel PhotometricInterpretation Rows Columns BitsAllocated BitsStored HighBit "
+        "PixelRepresentation PixelData",
         "",
     ),
     "US Region Calibration, C.8.5.5": ("SequenceOfUltrasoundRegions", ""),
@@ -39,7 +41,8 @@ REQUIRED = {
     "SOP Common, C.12.1": ("SOPClassUID SOPInstanceUID", ""),
 }
 REQUIRED_OF_A_REGION = (
-    "RegionSpatialFormat RegionDataType RegionFlags RegionLocationMinX0 RegionLocationMinY0 RegionLocationMaxX1 "
+    "RegionSpatialFormat RegionDataType RegionFlags RegionLocationMinX0 RegionLocationMinY0 "
+    "RegionLocationMaxX1 "
     "RegionLocationMaxY1 PhysicalUnitsXDirection PhysicalUnitsYDirection PhysicalDeltaX PhysicalDeltaY"
 )
 

@@ -1,4 +1,6 @@
-"""Doppler against 2 f v cos(theta) / c: a vessel phantom, aliasing, the wall filter, tissue that turns, colours."""
+"""Doppler against 2 f v cos(theta) / c: a vessel phantom, aliasing, the wall filter, tissue that turns,
+colours.
+"""
 
 import numpy as np
 import pytest
@@ -46,7 +48,9 @@ class Vessel:
         fill((self.flow.voxels, np.tile([*velocity_m_s, resistive_index, amplitude], (8, 1))))
 
     def look(self, probe: Probe, time_s: float = SYSTOLE_S, **given) -> np.ndarray:
-        """Velocities (beats, scanlines, samples) [cm/s] of the middle of the image at the same time of several beats."""
+        """Velocities (beats, scanlines, samples) [cm/s] of the middle of the image at the same time of
+        several beats.
+        """
         self.tank.look(probe, "speckle")
         doppler = self.steered if probe.colour_steering_deg else self.straight
         found = []
@@ -248,12 +252,15 @@ def test_colour_begins_at_an_energy_that_falls_as_its_gain_rises(vessel, gain, t
         vessel.tank.look(probe, "speckle")
         image = vessel.straight.render(probe, grey, "colour", SYSTOLE_S)
         shown.append((image[40:200, 40:200] > 0).any(axis=-1).mean())
-    # The energy of an estimate has a standard error of 0.5 / sqrt(2 x 10) = 11 %, and 2 dB are 37 or 58 % of it.
+    # The energy of an estimate has a standard error of 0.5 / sqrt(2 x 10) = 11 %, and 2 dB are 37 or 58 % of
+    # it.
     assert shown[0] < 0.02 and shown[1] > 0.9
 
 
 def test_velocities_within_the_wall_filter_have_no_colour(vessel):
-    """Noise alone has any phase: of a filter of 15 cm/s and a limit of 60, a quarter is not shown, though all of it is above the threshold."""
+    """Noise alone has any phase: of a filter of 15 cm/s and a limit of 60, a quarter is not shown, though
+    all of it is above the threshold.
+    """
     vessel.tank.fill()
     vessel.set_flow([0.0, 0.0, 0.0], amplitude=0.0)
     probe = probe_of(**SETTINGS | dict(noise_db=-90.0, colour_gain_percent=100.0, wall_filter_cm_s=15.0))
@@ -273,7 +280,9 @@ def test_velocities_within_the_wall_filter_have_no_colour(vessel):
     ],
 )
 def test_a_colour_is_the_share_of_its_scale(vessel, mode, stops, share, velocity_cm_s, above_db):
-    """Of the velocity's limit, 60 cm/s, or of the 25 dB that are shown of the power from 6 dB above the noise."""
+    """Of the velocity's limit, 60 cm/s, or of the 25 dB that are shown of the power from 6 dB above the
+    noise.
+    """
     probe = probe_of(**SETTINGS | {"noise_db": -90.0})
     vessel.tank.fill()
     energy = noise_energy(probe) * (10 ** (above_db / 10) - 1)
@@ -283,13 +292,16 @@ def test_a_colour_is_the_share_of_its_scale(vessel, mode, stops, share, velocity
     found = np.median(image[40:200, 40:200].reshape(-1, 3), axis=0)
     at = share * (len(stops) - 1)
     expected = [np.interp(at, np.arange(len(stops)), channel) for channel in stops.T]
-    # From one stop to the next, a third of the range, a channel changes by up to 200 levels: half a step of 64 is 5 of them, and 1 % of
-    # the range, by which the median of some hundred independent samples is off, is 6.
+    # From one stop to the next, a third of the range, a channel changes by up to 200 levels: half a step of
+    # 64 is 5 of them, and 1 % of the range, by which the median of some hundred independent samples is off,
+    # is 6.
     assert found == pytest.approx(np.array(expected), abs=11)
 
 
 def test_the_error_of_an_estimate_is_that_of_ten_pulses(vessel):
-    """Kasai's estimate of N pulses: the autocorrelation has a relative error of 1 / sqrt(N), half of it across its phase."""
+    """Kasai's estimate of N pulses: the autocorrelation has a relative error of 1 / sqrt(N), half of it
+    across its phase.
+    """
     probe = probe_of(**SETTINGS | {"noise_db": -105.0})
     # 6 dB less in the narrower band, and 10 dB less in the mean of ten pulses.
     assert 10 * np.log10(noise_energy(probe)) == pytest.approx(-105.0 - 6.0 - 10.0)
@@ -303,7 +315,7 @@ def test_the_error_of_an_estimate_is_that_of_ten_pulses(vessel):
 def test_an_anatomy_has_flow_only_within_its_volume(vessel):
     tank = vessel.tank
     tank.fill(TISSUE, 0.0, 0.01)
-    nowhere = SampledVolume(np.ones((1, 1, 1, 5)), np.array([[1, 0, 0, 500.0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), outside=0.0)  # fmt: skip
+    nowhere = SampledVolume(np.ones((1, 1, 1, 5)), np.eye(4) + 500.0 * np.eye(4, k=3), outside=0.0)
     doppler, probe = Doppler(tank.bmode.sound, tank.bmode, nowhere), probe_of(**SETTINGS, **QUIET)
     tank.look(probe, "speckle")
     doppler.estimate(probe)

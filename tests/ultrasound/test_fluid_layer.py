@@ -1,4 +1,6 @@
-"""Irrigation fluid between array and organ: what passes it, how long it takes, and where it couples; closed forms."""
+"""Irrigation fluid between array and organ: what passes it, how long it takes, and where it couples;
+closed forms.
+"""
 
 import numpy as np
 import pytest
@@ -187,7 +189,9 @@ def test_no_blood_flows_in_it(half_space):
 
 
 def test_beside_a_surface_that_a_scanline_passes_in_the_depth_there_is_no_fluid(taichi):
-    """As in the hilum: nearer to the organ than the layer is thick around a depth of 20 mm alone, and nowhere inside."""
+    """As in the hilum: nearer to the organ than the layer is thick around a depth of 20 mm alone, and
+    nowhere inside.
+    """
     tank = wet(flat_tank(0.5), lambda x, y: 0.5 * GAP_MM + np.abs(y - 20.0))
     tank.fill(impedance=FAT, attenuation=0.6)
     tank.look(probe_of(), at=(0, -1.0, 0))

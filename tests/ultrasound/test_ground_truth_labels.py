@@ -1,4 +1,6 @@
-"""GroundTruthLabels: what each pixel is, against shapes cut by a plane; and the matrices beside a picture, against the picture."""
+"""GroundTruthLabels: what each pixel is, against shapes cut by a plane; and the matrices beside a picture,
+against the picture.
+"""
 
 import numpy as np
 import pytest
@@ -59,7 +61,8 @@ def test_a_box_is_marked_where_the_plane_cuts_it(device):
     # 26 x 14 mm on the plane, from w = -3 to 9: neither its sides nor its place are alike along the axes.
     marks = GroundTruthLabels(taken(), distance_volume(box((26, 14, 12), -6, 31, 3), 1.0)).render()
     aside = np.maximum(np.abs(U + 6) - 13, np.abs(V - 31) - 7)
-    # Distances are linear near its faces; linear between points 1 mm apart they are off around its edges alone.
+    # Distances are linear near its faces; linear between points 1 mm apart they are off around its edges
+    # alone.
     assert np.array_equal(marks[np.abs(aside) > 0.3] == PixelLabel.ORGAN, aside[np.abs(aside) > 0.3] < 0)
     assert set(np.unique(marks)) == {PixelLabel.OUTSIDE, PixelLabel.ORGAN}
     # Half a pixel along each side.
@@ -77,7 +80,8 @@ def test_balls_are_marked_as_large_as_the_plane_cuts_them(device):
     inside, bead = marks % PixelLabel.BEAD, marks // PixelLabel.BEAD
     # The last bead's middle is farther off the plane than it reaches.
     assert set(np.unique(inside)) == {0, 1, 2} and set(np.unique(bead)) == {0, 1, 2, 3}
-    # Linear distances 2 mm apart, of facets that are 0.1 % in, move an outline by a tenth of a millimetre; a pixel has 0.4 x 0.5.
+    # Linear distances 2 mm apart, of facets that are 0.1 % in, move an outline by a tenth of a millimetre; a
+    # pixel has 0.4 x 0.5.
     for shown, radius, off, place in [
         (inside >= PixelLabel.ORGAN, 20, 6, (2, 25)),
         (inside == PixelLabel.TUMOUR, 7, -4, (9, 33)),
@@ -87,7 +91,8 @@ def test_balls_are_marked_as_large_as_the_plane_cuts_them(device):
     ]:
         cut = np.sqrt(radius**2 - off**2)
         assert middle(shown) == pytest.approx(place, abs=0.2)
-        # Pixels on the outline are counted or not as their middles lie, half of them each: to half a pixel's breadth.
+        # Pixels on the outline are counted or not as their middles lie, half of them each: to half a pixel's
+        # breadth.
         assert shown.sum() * PIXEL_MM == pytest.approx(np.pi * cut**2, abs=2 * np.pi * cut * 0.25)
         distance = np.hypot(U - place[0], V - place[1]) - cut
         assert np.array_equal(shown[np.abs(distance) > 0.2], distance[np.abs(distance) > 0.2] < 0)
@@ -145,7 +150,8 @@ def test_the_matrices_beside_a_picture_lead_to_where_its_pixels_were_at_rest(dev
 
 def test_the_matrices_beside_a_picture_lead_to_what_it_shows(device):
     shown = patient_from_pixels()
-    # A bright spot in the patient, at a pixel that neither mirror nor transpose leaves in place; a tumour at another.
+    # A bright spot in the patient, at a pixel that neither mirror nor transpose leaves in place; a tumour at
+    # another.
     spot, tumour = ((shown @ [*at, 0, 1])[:3] for at in ((83, 41), (30, 95)))
     first, voxel = spot - [20, 21, 22], 1.5
     grid = first + voxel * np.moveaxis(np.indices((30, 30, 30)), 0, -1)

@@ -71,7 +71,8 @@ def test_the_angle_to_a_wavefront_is_that_of_the_turn_or_of_the_way_around_the_a
     turned = first.copy()
     turned[:3, :3] = rotation_about([0, 0, 1], 4.0) @ first[:3, :3]
     found = wavefront.angle_deg(probe, turned)
-    # Turned about the middle of the face, 20 mm above the middle of the image and, of a curved array, 60 mm below the apex.
+    # Turned about the middle of the face, 20 mm above the middle of the image and, of a curved array, 60 mm
+    # below the apex.
     assert found == pytest.approx(4.0 if geometry == "LINEAR" else 4.0 * 60 / 80, rel=0.05)
 
 
@@ -80,7 +81,8 @@ def test_the_signal_is_that_of_the_image(tank):
     decibel = tank.look(probe, "speckle")
     plane = np.asarray(plane_at(probe, (0, 0, 0)).world_from_plane, float)
     iq, rest = tank.bmode.iq_of_last(probe, Wavefront.of(probe, plane))
-    # At the place of reference the phase of all scanlines turns alike: it changes no magnitude, but for rounding of 0.1 rad.
+    # At the place of reference the phase of all scanlines turns alike: it changes no magnitude, but for
+    # rounding of 0.1 rad.
     found = 20 * np.log10(np.abs(iq) + 1e-9)
     assert np.median(np.abs(found - decibel + probe.gain_db())) < 0.01
     u, depth = probe.scanlines()[0][:, 0], (np.arange(640) + 0.5) * probe.sample_mm

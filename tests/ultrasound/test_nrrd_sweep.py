@@ -11,7 +11,8 @@ from test_sweep import PIXELS, QUARTER_TURN, SAMPLES, SCALED, tracked
 from ultrasound.sweep import ORIENTATIONS, Sweep, SweepError, transform_text
 from ultrasound.sweep_file import read_ground_truth, read_sweep, write_sweep
 
-# As vtkIGSIONrrdSequenceIO writes it: its own fields in alphabetical order and padded, the user's like these, the frames' as keys.
+# As vtkIGSIONrrdSequenceIO writes it: its own fields in alphabetical order and padded, the user's like these,
+# the frames' as keys.
 PLUS = """NRRD0004
 # Complete NRRD file format specification at:
 # http://teem.sourceforge.net/nrrd/format.html
@@ -140,7 +141,9 @@ def test_orientations(tmp_path, orientation):
 
 
 def made():
-    """A sweep with all that is easily lost: names, spaces, colons, letters beyond ASCII, a frame without a pose."""
+    """A sweep with all that is easily lost: names, spaces, colons, letters beyond ASCII, a frame without a
+    pose.
+    """
     frames = [
         tracked(ProbeToReference=SCALED) | {"Timestamp": "0.5", "ImageStatus": "OK", "Note": "  a: =b \xe4 "},
         tracked(ProbeToReference=None) | {"Timestamp": "1.0", "ImageStatus": "INVALID"},
@@ -203,13 +206,17 @@ HOSTILE = {
     "no colon": (dict(lines={"endian: little": "endian little"}), "'endian little': expected name: value"),
     "twice": (dict(lines={"endian: little": "type: uint8"}), "'type': found twice"),
     "a frame's twice": (dict(lines={"Seq_Frame0001_Timestamp": "Seq_Frame0001_FrameNumber"}), "found twice"),
-    "no frame's number": (dict(lines={"Seq_Frame0001_Status": "Seq_FrameX_Status"}), "expected Seq_Frame0000_Name"),
+    "no frame's "
+    "number": (dict(lines={"Seq_Frame0001_Status": "Seq_FrameX_Status"}), "expected Seq_Frame0000_Name"),
     "a frame missing": (dict(lines={"  2\n": "  3\n"}), "sizes has 3 frames, but 2 have fields"),
     "no type": (dict(lines={"type: uint8\n": ""}), "type = '': expected uint8"),
     "16 bits": (dict(lines={"uint8": "uint16"}), "type = 'uint16': expected uint8"),
-    "no orientation": (dict(lines={"ultrasound image orientation:=MF\n": ""}), "ultrasound image orientation = ''"),
+    "no "
+    "orientation": (dict(lines={"ultrasound image "
+            "orientation:=MF\n": ""}), "ultrasound image orientation = ''"),
     "descending": (dict(lines={"orientation:=MF": "orientation:=MFD"}), "'MFD': expected MF or"),
-    "colours": (dict(lines={"domain domain     ": "vector domain     "}), "kinds = .*expected domain domain list or"),
+    "colours": (dict(lines={"domain domain     ": "vector domain     "}), "kinds = .*expected domain domain "
+            "list or"),
     "as 3D Slicer": (dict(lines={"domain domain                list": "list domain domain"}), "kinds = "),
     "no kinds": (dict(lines={"kinds: domain domain                list\n": ""}), "kinds = ''"),
     "two sizes": (dict(lines={"4 3   ": "4   "}), "sizes = .*expected columns rows frames"),
@@ -219,7 +226,9 @@ HOSTILE = {
         dict(lines={"domain                list": "domain domain list", "4 3   ": "4 1 3   "}),
         "expected images, not volumes",
     ),
-    "another file": (dict(lines={"endian: little": "data file: ../other.raw"}), "data file = .*right after the header"),
+    "another "
+    "file": (dict(lines={"endian: "
+            "little": "data file: ../other.raw"}), "data file = .*right after the header"),
     "skipped bytes": (dict(lines={"endian: little": "byte skip: -1"}), "byte skip = '-1'"),
     "text": (dict(encoding="ascii"), "encoding = 'ascii': expected raw or gz or gzip"),
     "bzip2": (dict(encoding="bz2", pixels=b""), "encoding = 'bz2'"),
@@ -229,7 +238,8 @@ HOSTILE = {
     "cut off": (dict(encoding="gz", pixels=SQUEEZED[:-5]), "not whole gzip data"),
     "bad checksum": (dict(encoding="gz", pixels=SQUEEZED[:-8] + bytes(8)), "not whole gzip data"),
     "left over": (dict(encoding="gz", pixels=SQUEEZED + b"xxxx"), "not whole gzip data"),
-    "fewer": (dict(encoding="gz", pixels=gzip.compress(bytes(23))), "23 bytes of pixels or more in the gzip data"),
+    "fewer": (dict(encoding="gz", pixels=gzip.compress(bytes(23))), "23 bytes of pixels or more in the gzip "
+            "data"),
     "a bomb": (dict(encoding="gz", pixels=gzip.compress(bytes(10_000_000))), "25 bytes of pixels or more"),
 }  # fmt: skip
 

@@ -39,7 +39,8 @@ def test_a_ball_gives_the_circle_of_its_distance(ball, distance):
     plane = oblique_plane()
     plane[2, 3] = distance
     segments = cut(ball, plane)
-    # The facets lie between the sphere and the one that touches the nearest of them, and the outline between their circles.
+    # The facets lie between the sphere and the one that touches the nearest of them, and the outline between
+    # their circles.
     nearest = np.einsum("ij,ij->i", ball.face_normals, ball.triangles[:, 0]).min()
     inner, outer = np.sqrt(np.array([nearest, RADIUS]) ** 2 - distance**2)
     reach = np.linalg.norm(segments - plane[:2, 3], axis=2)

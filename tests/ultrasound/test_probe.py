@@ -222,8 +222,9 @@ def test_gain_is_the_sum_of_knob_course_and_sliders():
         gain_percent=65.0, depth_compensation_db_cm_mhz=0.7, time_gain_compensation=sliders, depth_mm=64.0
     )
     gain = probe.gain_db()
-    # 65 % is 15 % of 60 dB up. At 4, 12, 20 .. 60 mm sliders hold, 24 dB over their range, in between they are mixed, and
-    # before the first and behind the last they stay; 0.7 dB/cm/MHz are 0.14 dB/mm/MHz, there and back.
+    # 65 % is 15 % of 60 dB up. At 4, 12, 20 .. 60 mm sliders hold, 24 dB over their range, in between they
+    # are mixed, and before the first and behind the last they stay; 0.7 dB/cm/MHz are 0.14 dB/mm/MHz, there
+    # and back.
     for depth, slider in (
         (2.05, 10.0),
         (12.05, 20.0 + 10 * 0.05 / 8),
@@ -268,7 +269,8 @@ def test_of_a_tilted_probe_only_the_aperture_in_contact_receives(gated):
     u = probe.scanlines()[0][:, 0]
     # To 1 mm, the first tissue sample, rays of the aperture are less than 0.2 mm aside.
     assert np.abs(decibel[u < -0.25, :8] + 20.0).max() < 1e-3 and decibel[u > 0.25, :8].max() < SILENT_DB
-    # Deep down the lines on either side of the end of contact transmit, and receive, with half of the aperture: 3 or 4 of 7 rays.
+    # Deep down the lines on either side of the end of contact transmit, and receive, with half of the
+    # aperture: 3 or 4 of 7 rays.
     at_end = decibel[LINES // 2 - 1 : LINES // 2 + 1, 600]
     assert at_end == pytest.approx(np.full(2, -20.0 + 40 * np.log10(0.5)), abs=40 * np.log10(3.5 / 3) + 0.05)
     pressed = advanced(pose_at((0.0, -1.0, 0.0), tilted, (1.0, 0.0, 0.0), 20.0), 2.5)

@@ -200,7 +200,8 @@ def test_tilts_end_where_a_hand_does(manipulator):
 def test_a_curved_face_touches_where_its_arc_does():
     size, radius = np.array([66.0, 16.0, 30.0]), 60.0
     pose = pose_at(np.zeros(3), np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), size[2])
-    # A plane is touched by the middle of the arc; a bump beside it, as high as the arc is there, at the same time.
+    # A plane is touched by the middle of the arc; a bump beside it, as high as the arc is there, at the same
+    # time.
     bump = np.array([20.0, 0.0, radius - np.sqrt(radius**2 - 20.0**2)])
     assert indentation(pose, size, np.zeros((1, 3)), radius) == pytest.approx(0.0)
     assert indentation(pose, size, bump[None], radius) == pytest.approx(0.0)
@@ -275,8 +276,9 @@ def on_the_arc(towards: np.ndarray, way_mm: float) -> np.ndarray:
     return RADIUS * (np.sin(angle) * np.asarray(towards, float) + np.cos(angle) * np.array([0, 0, 1.0]))
 
 
-# A step d along the tangent becomes R atan(d / R), 0.01 % less for 0.6 mm; the sphere's edges are 2.2 mm long, so that its
-# faces lie up to 2.2^2 / (8 R) = 0.02 mm under it, and their smoothed normals rock a step by no more than that over an edge.
+# A step d along the tangent becomes R atan(d / R), 0.01 % less for 0.6 mm; the sphere's edges are 2.2 mm
+# long, so that its faces lie up to 2.2^2 / (8 R) = 0.02 mm under it, and their smoothed normals rock a step
+# by no more than that over an edge.
 @pytest.mark.parametrize(
     ("lateral", "elevation"), [(20.0, 0.0), (-20.0, 0.0), (0.0, 20.0), (0.0, -20.0), (9.0, -12.0)]
 )

@@ -23,7 +23,8 @@ def test_losses_and_length_are_those_of_the_spectrum(frequency):
 
 def test_a_narrow_band_loses_what_a_single_frequency_does_and_keeps_its_length():
     narrow = attenuated_pulse(6.0, 20.0)
-    # A band of 1.2 MHz, an SD of 0.4 MHz: the centre moves by 0.16 MHz for each Np/MHz, the loss is less by half of that in Np.
+    # A band of 1.2 MHz, an SD of 0.4 MHz: the centre moves by 0.16 MHz for each Np/MHz, the loss is less by
+    # half of that in Np.
     assert narrow.speckle_db[20] == pytest.approx(-NEPER_DB * 6.0, rel=0.03)
     assert narrow.axial_sd_mm[20] == pytest.approx(narrow.axial_sd_mm[0], rel=0.03)
 

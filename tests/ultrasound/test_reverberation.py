@@ -1,4 +1,6 @@
-"""Reverberation: what is seen by way of gas, tails of metal, repeated echoes, and the array's own vibration."""
+"""Reverberation: what is seen by way of gas, tails of metal, repeated echoes, and the array's own
+vibration.
+"""
 
 import numpy as np
 import pytest
@@ -60,7 +62,8 @@ def test_behind_gas_is_the_mirror_image_of_what_is_in_front_of_it(tank, attenuat
         mirrored = 60.0 - at
         wanted = BY_GAS * surface**2 / arrived[int(mirrored / step)] * scatter
         assert np.interp(at, depth, middle) == pytest.approx(wanted, rel=0.15)
-    # Behind the mirror image of the face, all of it from the face on, which sound has reached by way of the gas.
+    # Behind the mirror image of the face, all of it from the face on, which sound has reached by way of the
+    # gas.
     wanted = BY_GAS * FACE * surface * np.interp(13.0, depth, arrived) * 0.01
     assert np.interp(73.0, depth, middle) == pytest.approx(wanted, rel=0.15)
 
@@ -144,8 +147,9 @@ def test_the_array_vibrates_in_the_near_field_longer_in_air(tank):
     assert contact == pytest.approx(10**-1.5 * np.exp(-wavelengths / FALL), rel=1e-5)
     crest = np.argmin(np.abs(wavelengths - LENS))
     trough = np.argmin(np.abs(wavelengths - LENS / 2))
-    # Between the two it falls, and the bands go from their least to their most. Half of a sample is 0.3 wavelengths: 3 % of the fall each,
-    # and of the bands a cosine of 0.36 radians instead of 0: 4 % of the least, 2 % of the most.
+    # Between the two it falls, and the bands go from their least to their most. Half of a sample is 0.3
+    # wavelengths: 3 % of the fall each, and of the bands a cosine of 0.36 radians instead of 0: 4 % of the
+    # least, 2 % of the most.
     crest_over_trough = np.exp(-LENS / 2 / FALL_IN_AIR) / (1 - 2 * BANDS)
     assert air[crest] / air[trough] == pytest.approx(crest_over_trough, rel=0.12)
     more = 10 ** (MORE_IN_AIR_DB / 20) * np.exp(wavelengths[0] * (1 / FALL - 1 / FALL_IN_AIR))

@@ -40,7 +40,8 @@ def test_a_volume_of_vectors_is_sampled_as_each_of_its_parts(device):
                 apart[i][k] = parts[k].sample(given[i])
 
     ask(whole, parts, given, found, apart)
-    # The compiler may fuse the same sums differently: rounding of values of 4, at a place rounded to 1e-6 of a voxel.
+    # The compiler may fuse the same sums differently: rounding of values of 4, at a place rounded to 1e-6 of
+    # a voxel.
     assert array_of(found) == pytest.approx(array_of(apart), abs=1e-5)
     assert (array_of(found) != -1000.0).any() and (array_of(found) == -1000.0).any()
 
@@ -56,7 +57,8 @@ def test_places_sampled_together_have_the_values_that_they_have_alone(device, sh
         np.random.default_rng(7).uniform(-0.8, np.array(shape) - 0.2, (400, 3))
         @ np.linalg.inv(index_from_mm[:3, :3]).T
     )
-    # Half of the lines stay within a voxel, half cross several and the border, where the last half voxel still counts.
+    # Half of the lines stay within a voxel, half cross several and the border, where the last half voxel
+    # still counts.
     ways = np.random.default_rng(8).normal(size=(400, 3)) * np.where(np.arange(400) % 2, 0.01, 0.4)[:, None]
     places = (starts[:, None] + np.arange(LANES)[:, None] * ways[:, None]).astype(np.float32)
     together, alone = np.zeros((2, 400, LANES), np.float32)
@@ -112,7 +114,8 @@ def test_the_gradient_of_a_volume_is_that_over_a_voxel_to_each_side_and_its_slop
         along[:, axis] = (value(high) - value(low)) / (high - low)[:, axis]
     # Float32 of values of 4, in voxels of 0.7 mm at least.
     assert array_of(gradient)[:300] == pytest.approx(along @ index_from_mm[:3, :3], abs=3e-5)
-    # A trilinear value is linear along each axis of its cell: so its slope is the difference of the cell's two sides.
+    # A trilinear value is linear along each axis of its cell: so its slope is the difference of the cell's
+    # two sides.
     middle, within = np.clip(inside, 0, last), np.empty((300, 3))
     cell = np.minimum(np.floor(middle), last - 1)
     for axis in range(3):

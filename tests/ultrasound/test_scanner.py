@@ -1,4 +1,7 @@
-"""The scanner: that each side of it is given what it asks for. What a side makes of it has tests of its own."""
+"""The scanner: that each side of it is given what it asks for.
+
+What a side makes of it has tests of its own.
+"""
 
 import gc
 import weakref
@@ -90,7 +93,8 @@ def test_an_image_of_fewer_pixels_shows_the_same_places(of_60_pixels, shape):
     scanner = of_60_pixels
     look = plane_at(), PROBE, "both", "speckle", 400.0, 20.0
     whole, smaller = scanner.images(*look).by_name, scanner.images(*look, shape).by_name
-    # Of three pixels the middle one has the centre of a pixel three times as large. Maps in float32 differ by rounding, of 30 mm by 2e-6.
+    # Of three pixels the middle one has the centre of a pixel three times as large. Maps in float32 differ by
+    # rounding, of 30 mm by 2e-6.
     middle = tuple(slice(1, None, 3) if count == 20 else slice(None) for count in shape)
     for name, image in smaller.items():
         assert image.shape == shape and np.ptp(whole[name]) > 50
@@ -124,7 +128,8 @@ def test_acoustics_started_before_give_the_same_image(usual):
 @pytest.mark.parametrize("gap", [1.5, 4.0])
 def test_sound_enters_as_near_to_the_organ_as_asked_for(usual, gap):
     scanner = usual if gap == 1.5 else Scanner(anatomy(), Unmoved(), PROBE, PIXELS, contact_gap_mm=gap)
-    # A line at the middle has the 1 mm of its element's own contact; facets and distances 2 mm apart are 0.2 mm off.
+    # A line at the middle has the 1 mm of its element's own contact; facets and distances 2 mm apart are 0.2
+    # mm off.
     assert echo(scanner, plane_at(gap - 0.4))[:40].max() > -100.0
     assert echo(scanner, plane_at(gap + 0.4))[:40].max() < -170.0
 
@@ -142,7 +147,8 @@ def test_beyond_the_ct_is_silence(usual):
     decibel = echo(usual, plane_at())
     depth = (np.arange(320) + 0.5) * PROBE.sample_mm
     within = depth < RADIUS + REACH - 1.0
-    # The array is in touch with the ball for 5 mm to either side; the least that a line holds is 20 log10(1e-9).
+    # The array is in touch with the ball for 5 mm to either side; the least that a line holds is 20
+    # log10(1e-9).
     assert decibel[within].min() > -120.0 and decibel[depth > RADIUS + REACH + 1.0].max() < -179.9
 
 

@@ -34,7 +34,9 @@ def parts_of(path) -> tuple[list[bytes], bytes]:
 
 
 def file_of(path, pixels=bytes(12), raw="", **changed):
-    """A small metafile of one frame of 4 x 3 pixels, with fields changed, or left out where None; ``raw`` comes before the end."""
+    """A small metafile of one frame of 4 x 3 pixels, with fields changed, or left out where None; ``raw``
+    comes before the end.
+    """
     fields = {
         "ObjectType": "Image",
         "NDims": "3",
@@ -91,7 +93,8 @@ def test_a_sweep_of_poses_alone(data):
 
 def test_a_chain_is_the_product_of_its_transforms(tmp_path):
     sweep = frame_of(**tracked(ImageToProbe=SCALED, ProbeToTracker=QUARTER_TURN, ReferenceToTracker=SCALED))
-    # Pixel (4, 8): in Probe (3, 4, 3), in Tracker (10 - 4, 20 + 3, 33), in Reference ((6 - 1) / 0.5, (23 - 2) / 0.25, 30).
+    # Pixel (4, 8): in Probe (3, 4, 3), in Tracker (10 - 4, 20 + 3, 33), in Reference ((6 - 1) / 0.5, (23 - 2)
+    # / 0.25, 30).
     assert sweep.transform("Image", "Tracker", 0) @ [4, 8, 0, 1] == pytest.approx([6, 23, 33, 1])
     assert sweep.transform("Image", "Reference", 0) @ [4, 8, 0, 1] == pytest.approx([10, 84, 30, 1])
     assert sweep.transform("Reference", "Image", 0) @ [10, 84, 30, 1] == pytest.approx([4, 8, 0, 1])
@@ -235,7 +238,9 @@ def test_bytes_beyond_ascii_and_spaces_stay(tmp_path, end):
 
 
 def written(path, **fields):
-    """A sweep of moving transforms, the second unseen, as its writer makes it; the first image is not valid."""
+    """A sweep of moving transforms, the second unseen, as its writer makes it; the first image is not
+    valid.
+    """
     with SweepWriter(path, fields) as writer:
         for frame in range(3):
             probe = None if frame == 1 else QUARTER_TURN * [1, 1, 1, frame] + np.diag([0.0, 0, 0, 1 - frame])

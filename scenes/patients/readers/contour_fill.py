@@ -1,4 +1,6 @@
-"""Fill the closed contours of one plane: nested ones alternate, crossing ones are united, and what stands there twice counts once."""
+"""Fill the closed contours of one plane: nested ones alternate, crossing ones are united, and what stands
+there twice counts once.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,8 +13,8 @@ from scipy.sparse import coo_array, csgraph
 ON_CONTOUR = 2e-4
 # Two contours are copies where no square of this width [pixels] fits between them: no drawn wall is so thin.
 COPY_PIXELS, SAMPLES = 0.5, 4
-# Two contours of a solid are one, drawn twice, from this intersection over union on: 2 mm within a circle of 20 mm radius it is 0.8;
-# of a hole with half of the section's area, wider than a kidney's sinus, 0.5.
+# Two contours of a solid are one, drawn twice, from this intersection over union on: 2 mm within a circle of
+# 20 mm radius it is 0.8; of a hole with half of the section's area, wider than a kidney's sinus, 0.5.
 LEAST_IOU = 0.7
 # A contour with two rounds comes back to its start, within this share of its extent.
 RETURN = 0.05
@@ -38,14 +40,16 @@ def fill_plane(
 ) -> FilledPlane:
     """The pixels inside the contours of a plane, or on one of them.
 
-    By the even-odd rule, but for contours that cross: these are strokes of one body. Contours that share an edge leave no slit
-    between them, and neither does the channel from a contour to its hole (keyhole).
+    By the even-odd rule, but for contours that cross: these are strokes of one body. Contours that share an
+    edge leave no slit between them, and neither does the channel from a contour to its hole (keyhole).
 
     Args:
         contours: corners (n, 2) of each: rows and columns [pixels].
         shape: rows and columns.
-        wall: the least width (rows, columns) [pixels] of the walls of a solid: what is nowhere as wide between two contours,
-            or small beside what they share, is no wall but one contour drawn twice, and the larger one counts. None: any region.
+        wall: the least width (rows, columns) [pixels] of the walls of a solid: what is nowhere as wide
+        between two contours,
+            or small beside what they share, is no wall but one contour drawn twice, and the larger one
+            counts. None: any region.
         is_exclusive: whether contours that cross are exclusive, too.
     """
     rounds = [_first_round(corners) for corners in contours]
@@ -61,7 +65,9 @@ def fill_plane(
 
 
 def _filled(contours: Sequence[np.ndarray], shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Masks of the pixels inside an odd number of contours, and of those on one: these may be in either or both."""
+    """Masks of the pixels inside an odd number of contours, and of those on one: these may be in either or
+    both.
+    """
     starts = np.concatenate(contours)
     ends = np.concatenate([np.roll(corners, -1, axis=0) for corners in contours])
     # One column more: a crossing beyond the last changes no pixel.
@@ -77,7 +83,9 @@ def _filled(contours: Sequence[np.ndarray], shape: tuple[int, int]) -> tuple[np.
 
 
 def _toggle_crossings(crossings: np.ndarray, start: np.ndarray, end: np.ndarray) -> None:
-    """Invert the first pixel at or beyond each crossing of an edge with a row; the row of an edge's greater end is the next edge's."""
+    """Invert the first pixel at or beyond each crossing of an edge with a row; the row of an edge's
+    greater end is the next edge's.
+    """
     first = np.ceil(np.minimum(start[:, 0], end[:, 0]))
     last = np.ceil(np.maximum(start[:, 0], end[:, 0])) - 1
     rows, columns = _rows_of(start, end, first, last, len(crossings))
@@ -99,7 +107,9 @@ def _mark_border(border: np.ndarray, start: np.ndarray, end: np.ndarray) -> None
 def _rows_of(
     start: np.ndarray, end: np.ndarray, first: np.ndarray, last: np.ndarray, height: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The rows from ``first`` to ``last`` of each edge within a picture, and the column of the edge on each of them."""
+    """The rows from ``first`` to ``last`` of each edge within a picture, and the column of the edge on
+    each of them.
+    """
     first = np.clip(first, 0, height).astype(int)
     count = np.maximum(np.clip(last, -1, height - 1).astype(int) - first + 1, 0)
     edge = np.repeat(np.arange(len(start)), count)
@@ -112,7 +122,9 @@ def _rows_of(
 
 
 def _first_round(contour: np.ndarray) -> np.ndarray:
-    """A contour, or its first round where its corners go round twice: by the even-odd rule, it would be empty."""
+    """A contour, or its first round where its corners go round twice: by the even-odd rule, it would be
+    empty.
+    """
     quarter = len(contour) // 4
     away = np.abs(contour - contour[0]).max(axis=1)
     at = quarter + int(np.argmin(away[quarter : len(contour) - quarter]))
@@ -124,7 +136,9 @@ def _first_round(contour: np.ndarray) -> np.ndarray:
 
 
 def _without_copies(contours: Sequence[np.ndarray], wall: np.ndarray | None) -> tuple[list[np.ndarray], int]:
-    """The contours of a plane without those that stand there twice, and how many of these are no exact copies; the largest remain."""
+    """The contours of a plane without those that stand there twice, and how many of these are no exact
+    copies; the largest remain.
+    """
     areas = np.array([_area(corners) for corners in contours])
     order = np.argsort(-areas, kind="stable")
     contours, areas = [contours[n] for n in order], areas[order]
@@ -165,7 +179,9 @@ def _are_copies(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _are_one(one: np.ndarray, other: np.ndarray, wall: np.ndarray) -> bool:
-    """Whether two contours of a solid, the smaller one last, enclose nearly the same, so that neither is a hole."""
+    """Whether two contours of a solid, the smaller one last, enclose nearly the same, so that neither is a
+    hole.
+    """
     first, second = _masks(one, other, [one, other], SAMPLES)
     shared = (first & second).sum()
     if shared >= LEAST_IOU * (first | second).sum():
@@ -174,7 +190,9 @@ def _are_one(one: np.ndarray, other: np.ndarray, wall: np.ndarray) -> bool:
 
 
 def _cross(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two contours, the smaller one last, share pixels, and each encloses what the other does not: nowhere thin as copies."""
+    """Whether two contours, the smaller one last, share pixels, and each encloses what the other does not:
+    nowhere thin as copies.
+    """
     first, second = _masks(one, other, [other])
     if not (first & second).any() or not (second & ~first).any():
         return False
@@ -188,7 +206,9 @@ def _cross(one: np.ndarray, other: np.ndarray) -> bool:
 def _masks(
     one: np.ndarray, other: np.ndarray, around: Sequence[np.ndarray], samples: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Masks of what each of two contours encloses, within the box around some, with so many samples along each pixel."""
+    """Masks of what each of two contours encloses, within the box around some, with so many samples along
+    each pixel.
+    """
     corners = np.concatenate(around)
     low = np.floor(corners.min(axis=0))
     rows, columns = np.ceil((corners.max(axis=0) - low) * samples).astype(int) + 1
@@ -199,7 +219,9 @@ def _masks(
 
 
 def _is_wide(mask: np.ndarray, width: np.ndarray | float) -> bool:
-    """Whether a rectangle of some width (rows, columns) [pixels] fits into a mask of SAMPLES along each pixel."""
+    """Whether a rectangle of some width (rows, columns) [pixels] fits into a mask of SAMPLES along each
+    pixel.
+    """
     rows, columns = (np.broadcast_to(width, 2) * SAMPLES).astype(int) + 1
     across = ndimage.minimum_filter1d(mask.view(np.uint8), columns, axis=1, mode="constant")
     return bool(ndimage.minimum_filter1d(across, rows, axis=0, mode="constant").any())

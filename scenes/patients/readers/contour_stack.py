@@ -1,6 +1,7 @@
 """Stack the closed contours of a region on evenly spaced planes, interpolated where a plane has no contour.
 
-Interpolation is shape-based (Raya and Udupa 1990): signed distances of the planes below and above, weighted by their nearness.
+Interpolation is shape-based (Raya and Udupa 1990): signed distances of the planes below and above, weighted
+by their nearness.
 """
 
 from dataclasses import dataclass
@@ -18,11 +19,13 @@ from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 # Contours within this height [mm] are of one plane.
 SAME_PLANE_MM = 0.1
-# A contour this near to a plane, as a share of the distance of planes, is on it: a CT's slices may be UNEVEN, and decimals are rounded.
+# A contour this near to a plane, as a share of the distance of planes, is on it: a CT's slices may be UNEVEN,
+# and decimals are rounded.
 ON_PLANE = UNEVEN + 0.01
 # The widest gap that is interpolated [mm]: three slices of 5 mm.
 MOST_GAP_MM = 15.0
-# A gap is near to one beside it in width up to this: contours on every second slice, then on every fourth; one slice left out.
+# A gap is near to one beside it in width up to this: contours on every second slice, then on every fourth;
+# one slice left out.
 WIDER = 2.5
 # A gap so much wider than usual lacks a contour, and so far beyond its last section a body may reach.
 LACKS = 1.5
@@ -30,7 +33,8 @@ LACKS = 1.5
 LEAST_OVERLAP = 0.25
 
 
-# The walls of an organ and its lesions are thicker; two contours of one organ, by two observers, may be as far apart.
+# The walls of an organ and its lesions are thicker; two contours of one organ, by two observers, may be as
+# far apart.
 WALL_MM = 2.5
 
 
@@ -78,7 +82,9 @@ class _Planes:
         return self.inside.sum(axis=(1, 2)) * float(np.prod(self.ct.spacing[:2]))
 
     def place(self, height: float) -> str:
-        """A height in words: the coordinate of the region's middle along the patient's axis that is nearest to the slices' normal."""
+        """A height in words: the coordinate of the region's middle along the patient's axis that is
+        nearest to the slices' normal.
+        """
         rows, columns = self.inside.shape[1:]
         middle = self.corner + np.array([columns - 1, rows - 1]) / 2
         axis = int(np.argmax(np.abs(self.ct.direction[:, 2])))
@@ -88,10 +94,12 @@ class _Planes:
 def stack_contours(
     region: DrawnRegion, ct: VoxelGrid, near: Box | None, progress: Progress
 ) -> FilledRegion | None:
-    """A region on planes of its contours, or on the CT's where these are uneven; in each a CT's pixels. None where none is near.
+    """A region on planes of its contours, or on the CT's where these are uneven; in each a CT's pixels. None
+    where none is near.
 
-    Nested contours on one plane alternate between inside and outside; contours that cross are united; a contour that stands there
-    twice counts once. An organ that has no pixel gets those nearest to its contours, with a warning.
+    Nested contours on one plane alternate between inside and outside; contours that cross are united; a
+    contour that stands there twice counts once. An organ that has no pixel gets those nearest to its
+    contours, with a warning.
 
     Args:
         region: its contours; of an organ, gaps that are too wide to interpolate are refused.
@@ -133,7 +141,8 @@ def stack_contours(
         _mark_nearest(inside, drawn)
         name = quoted(region.segment.name)
         warnings = (
-            f"{name} is smaller than a pixel: no contour encloses a pixel's centre; the pixel nearest to the middle of each was marked",
+            f"{name} is smaller than a pixel: no contour encloses a pixel's centre; the pixel nearest to the "
+            "middle of each was marked",
         )
     if len(levels) != len(heights) or np.abs(levels - heights).max() > ON_PLANE * step:
         planes = _Planes(heights, inside, low, ct)
@@ -153,7 +162,9 @@ def _notes(copies: int, differing: int, united: int) -> tuple[str, ...]:
 
 
 def _mark_nearest(inside: np.ndarray, drawn: list[list[np.ndarray]]) -> None:
-    """Mark, in planes (n, y, x), the pixel nearest to the middle of each contour, whose corners are rows and columns [pixels]."""
+    """Mark, in planes (n, y, x), the pixel nearest to the middle of each contour, whose corners are rows
+    and columns [pixels].
+    """
     last = np.array(inside.shape[1:]) - 1
     for plane, contours in zip(inside, drawn, strict=True):
         for corners in contours:
@@ -161,20 +172,26 @@ def _mark_nearest(inside: np.ndarray, drawn: list[list[np.ndarray]]) -> None:
 
 
 def _check_places(name: str, places: list[np.ndarray], ct: VoxelGrid) -> None:
-    """Raises PatientError where corners (voxels of the CT) are far outside it, or those of a contour are of several slices."""
+    """Raises PatientError where corners (voxels of the CT) are far outside it, or those of a contour are
+    of several slices.
+    """
     ends = np.array(ct.size)
     if any((place < -ends).any() or (place > 2 * ends).any() for place in places):
         raise PatientError(
-            f"{name}: contours are far outside this CT; expected contours on it; give the CT that they were drawn on"
+            f"{name}: contours are far outside this CT; expected contours on it; give the CT that they were "
+            "drawn on"
         )
     if max(np.ptp(place[:, 2]) for place in places) > 1:
         raise PatientError(
-            f"{name}: contours cross the slices of this CT; expected contours on them; give the CT that they were drawn on"
+            f"{name}: contours cross the slices of this CT; expected contours on them; give the CT that they "
+            "were drawn on"
         )
 
 
 def _by_plane(heights: np.ndarray, slice_mm: float) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The planes of contours at some heights [slices], as a CT's slices where all are there, and the contours (indices) of each."""
+    """The planes of contours at some heights [slices], as a CT's slices where all are there, and the
+    contours (indices) of each.
+    """
     if np.abs(heights - np.rint(heights)).max() <= ON_PLANE:
         heights = np.rint(heights)
     order = np.argsort(heights, kind="stable")
@@ -188,7 +205,9 @@ def _by_plane(heights: np.ndarray, slice_mm: float) -> tuple[np.ndarray, list[np
 
 
 def _even_planes(heights: np.ndarray, slice_mm: float) -> tuple[np.ndarray, float]:
-    """Heights [slices] of even planes with those of the contours among them, and their distance; else the CT's own planes."""
+    """Heights [slices] of even planes with those of the contours among them, and their distance; else the
+    CT's own planes.
+    """
     if len(heights) == 1:
         return heights, 1.0
     gaps = np.diff(heights)
@@ -209,7 +228,9 @@ def _usual(gaps: np.ndarray) -> float:
 def _on_levels(
     region: DrawnRegion, drawn: _Planes, levels: np.ndarray, step: float
 ) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
-    """The mask on even planes (``levels``, ``step`` [slices]): as drawn, interpolated, or as the nearest plane at an end; notes and warnings."""
+    """The mask on even planes (``levels``, ``step`` [slices]): as drawn, interpolated, or as the nearest
+    plane at an end; notes and warnings.
+    """
     continues, warnings = _continues(region, drawn)
     gaps = np.diff(drawn.heights)
     usual = _usual(gaps)
@@ -243,10 +264,11 @@ def _on_levels(
 
 
 def _continues(region: DrawnRegion, drawn: _Planes) -> tuple[list[bool], tuple[str, ...]]:
-    """Whether one body is on both sides of each gap between planes, and the gap can be interpolated; and warnings.
+    """Whether one body is on both sides of each gap between planes, and the gap can be interpolated; and
+    warnings.
 
-    The sections beside it overlap, and the gap is not much wider than one beside it, or one of the sections is no end of a body.
-    Raises PatientError where the gap of an organ is too wide.
+    The sections beside it overlap, and the gap is not much wider than one beside it, or one of the sections
+    is no end of a body. Raises PatientError where the gap of an organ is too wide.
     """
     gaps, areas = drawn.gaps_mm, drawn.areas
     usual = _usual(gaps)
@@ -265,7 +287,8 @@ def _continues(region: DrawnRegion, drawn: _Planes) -> tuple[list[bool], tuple[s
             between = " and ".join(map(drawn.place, drawn.heights[n : n + 2]))
             if region.is_organ:
                 raise PatientError(
-                    f"{region} has no contour between {between} mm; expected at most {MOST_GAP_MM:g} mm without one; draw the contours "
+                    f"{region} has no contour between {between} mm; expected at most {MOST_GAP_MM:g} mm "
+                    "without one; draw the contours "
                     "between, or make its parts regions of their own"
                 )
             warnings += (f"a gap too wide to interpolate was left empty, between {between} mm",)
@@ -273,7 +296,8 @@ def _continues(region: DrawnRegion, drawn: _Planes) -> tuple[list[bool], tuple[s
 
 
 def _is_end(section: float, areas: np.ndarray, usual_mm: float) -> bool:
-    """Whether a section [mm^2] may be the last of a body: the cap beyond it, of a ball with the largest section, is little higher than usual.
+    """Whether a section [mm^2] may be the last of a body: the cap beyond it, of a ball with the largest
+    section, is little higher than usual.
 
     Args:
         section: the one beside a gap.

@@ -78,7 +78,8 @@ class CtListing:
 def list_ct(path: Path, progress: Progress = silent, space: Space | None = None) -> CtListing:
     """The CT series and DICOM labels of a path as for ``open_ct``, from their headers.
 
-    A path with labels but without a CT has no series. Raises PatientError: not readable, or neither CT nor labels.
+    A path with labels but without a CT has no series. Raises PatientError: not readable, or neither CT nor
+    labels.
     """
     if not path.exists():
         raise PatientError(f"{path}: no such file or folder; check the path")
@@ -112,8 +113,10 @@ def open_ct(
     """Find a CT and read its headers; voxels are read on demand.
 
     Args:
-        path: a folder with DICOM files, in subfolders too; a DICOMDIR; a zip archive of DICOM files; an enhanced CT;
-            a .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd file, or a folder with one that is not named as labels.
+        path: a folder with DICOM files, in subfolders too; a DICOMDIR; a zip archive of DICOM files; an
+        enhanced CT;
+            a .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd file, or a folder with one that is not named as
+            labels.
         series: number or UID (or its end) of one of several series.
         labels: what the labels refer to; their series is preferred.
         grid: the labels' own voxels, where they are a label map.
@@ -145,7 +148,8 @@ def open_ct(
     damaged = [fault for s in found.candidates if s is not chosen and not s.slices for fault in s.faults]
     if found.unreadable:
         notes.append(
-            f"{len(found.unreadable)} subfolders cannot be read, so the series may be incomplete; check their permissions"
+            f"{len(found.unreadable)} subfolders cannot be read, so the series may be incomplete; check "
+            "their permissions"
         )
     with _naming("damaged", damaged), _naming("subfolders that cannot be read", found.unreadable):
         _check_split(path, chosen, found.candidates)
@@ -154,8 +158,8 @@ def open_ct(
 
 
 def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
-    """The contents of a folder, DICOMDIR or archive with DICOM files. Raises PatientError where there are neither these nor other
-    volumes.
+    """The contents of a folder, DICOMDIR or archive with DICOM files. Raises PatientError where there are
+    neither these nor other volumes.
     """
     unreadable: list[str] = []
     items = find_dicom_files(path, lambda error: unreadable.append(_below(path, error)))
@@ -163,13 +167,15 @@ def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
         raise PatientError(f"{path}: is a surface; expected a CT; give the CT first, then its labels")
     if not items and path.is_file():
         raise PatientError(
-            f"{path}: unknown kind of file; expected DICOM (a folder, a DICOMDIR or a zip archive), or a file that ends in "
+            f"{path}: unknown kind of file; expected DICOM (a folder, a DICOMDIR or a zip archive), or a "
+            "file that ends in "
             f"{', '.join(ENDINGS)}; convert it"
         )
     if not items and not volume_files(path):
         if any(is_surface_file(file) for file in entries_of(path)):
             raise PatientError(
-                f"{path}: has surfaces, and no CT; expected a CT before them: {shell_command('import', 'CT', path, '--out', 'FOLDER')}"
+                f"{path}: has surfaces, and no CT; expected a CT before them: "
+                f"{shell_command('import', 'CT', path, '--out', 'FOLDER')}"
             )
         if unreadable:
             raise PatientError(
@@ -193,8 +199,10 @@ def _check_split(path: Path, series: Series, candidates: list[Series]) -> None:
     count = sum(map(is_single, candidates))
     if is_single(series) and count > 1:
         raise PatientError(
-            f"{path}: {count} slices have a SeriesInstanceUID of their own each, and are no stack of one study, frame of reference, size "
-            "and spacing at even distances; expected a series of slices; export it again as one series, or give it as one volume file "
+            f"{path}: {count} slices have a SeriesInstanceUID of their own each, and are no stack of one "
+            "study, frame of reference, size "
+            "and spacing at even distances; expected a series of slices; export it again as one series, or "
+            "give it as one volume file "
             "(NIfTI, NRRD, MHA)"
         )
 
@@ -218,7 +226,8 @@ def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume
         )
     if len(series.pages) > len(series.slices):
         raise PatientError(
-            f"{path}: {len(series.pages)} of {len(series.pages) + len(series.slices)} files of this series are no slices: "
+            f"{path}: {len(series.pages)} of {len(series.pages) + len(series.slices)} files of this series "
+            "are no slices: "
             f"{next(iter(series.pages.values())).removeprefix(f'{path.name}: ')}; export the series again"
         )
     slices, strays = _one_view(series)

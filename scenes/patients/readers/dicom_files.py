@@ -1,4 +1,7 @@
-"""Find the DICOM files of a folder, a DICOMDIR or a zip archive, and parse them with bounded memory. Nothing is extracted to disk."""
+"""Find the DICOM files of a folder, a DICOMDIR or a zip archive, and parse them with bounded memory.
+
+Nothing is extracted to disk.
+"""
 
 import io
 import logging
@@ -19,7 +22,8 @@ from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian, 
 from errors import PatientError, parsing
 from scenes.folder_files import files_below, is_system_file
 
-# Values are validated where they are used; pydicom's warnings and logs would print them, also identifiers of the patient.
+# Values are validated where they are used; pydicom's warnings and logs would print them, also identifiers of
+# the patient.
 config.settings.reading_validation_mode = config.IGNORE
 logging.getLogger("pydicom").setLevel(logging.CRITICAL)
 
@@ -64,7 +68,10 @@ class SourceFile:
 
 
 def _check_inflated(file: BinaryIO, name: str) -> None:
-    """Raises PatientError where a deflated data set inflates to more than MOST_INFLATED. The meta header's length is not trusted."""
+    """Raises PatientError where a deflated data set inflates to more than MOST_INFLATED.
+
+    The meta header's length is not trusted.
+    """
     meta = read_dataset(file, False, True, stop_when=lambda tag, vr, length: tag.group != 2)
     if meta.get("TransferSyntaxUID") != DeflatedExplicitVRLittleEndian:
         return
@@ -84,8 +91,8 @@ def find_dicom_files(path: Path, unreadable: Callable[[OSError], object] | None 
 
     ``unreadable`` is called for each subfolder that cannot be listed.
 
-    Raises PatientError: too many or too large files, an archive that is damaged, encrypted or has paths outside itself, a
-    DICOMDIR whose files are missing or elsewhere.
+    Raises PatientError: too many or too large files, an archive that is damaged, encrypted or has paths
+    outside itself, a DICOMDIR whose files are missing or elsewhere.
     """
     if path.is_dir():
         items = _of_folder(path, unreadable)
@@ -119,7 +126,9 @@ def _begins_as_dicom(item: SourceFile) -> bool:
 
 
 def _looks_like_dicom(start: bytes) -> bool:
-    """Whether a file's first bytes are DICOM: with a preamble, or without one (group 2 or 8, little endian)."""
+    """Whether a file's first bytes are DICOM: with a preamble, or without one (group 2 or 8, little
+    endian).
+    """
     return start[MAGIC_AT:] == MAGIC or (start[:2] in (b"\x08\x00", b"\x02\x00") and start[3:4] == b"\x00")
 
 
@@ -129,7 +138,8 @@ def _of_folder(folder: Path, unreadable: Callable[[OSError], object] | None) -> 
         items.append(_disk_file(file, str(file.relative_to(folder))))
         if len(items) > MOST_FILES:
             raise PatientError(
-                f"{folder}: more than {MOST_FILES} files; expected one patient's; give the folder of the CT itself"
+                f"{folder}: more than {MOST_FILES} files; expected one patient's; give the folder of the CT "
+                "itself"
             )
     return items
 
@@ -191,7 +201,8 @@ def _of_archive(path: Path) -> list[SourceFile]:
     total = sum(entry.file_size for entry in found)
     if total > MOST_ARCHIVE_BYTES:
         raise PatientError(
-            f"{path}: extracts to {total / 2**30:.0f} GiB of DICOM; expected at most {MOST_ARCHIVE_BYTES / 2**30:.0f}; "
+            f"{path}: extracts to {total / 2**30:.0f} GiB of DICOM; expected at most "
+            f"{MOST_ARCHIVE_BYTES / 2**30:.0f}; "
             "give an archive of the CT alone"
         )
     return [SourceFile(entry.filename, partial(extracted, entry), None) for entry in found]
@@ -201,7 +212,8 @@ def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
     name = entry.filename
     if _is_outside(name):
         raise PatientError(
-            f"{path}: has an entry {name[:60]!r} with a path outside the archive; expected a plain archive of DICOM files; "
+            f"{path}: has an entry {name[:60]!r} with a path outside the archive; expected a plain archive "
+            "of DICOM files; "
             "do not trust it"
         )
     if entry.flag_bits & 1:

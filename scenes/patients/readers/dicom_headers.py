@@ -41,7 +41,8 @@ IDENTIFYING = (
 MODALITY = re.compile("[A-Z]{2,8}")
 # Values of ImageType of screen saves and dose reports, which may be in the series of their CT.
 PAGES = {"SCREEN SAVE", "DOSE_INFO"}
-# Words in values of ImageType of images that were computed from the slices of a CT, such as CT_SOM5 MIP or CURVED MPR.
+# Words in values of ImageType of images that were computed from the slices of a CT, such as CT_SOM5 MIP or
+# CURVED MPR.
 COMPUTED = frozenset({
     "MIP", "MINIP", "MAXIP", "IP", "AVERAGE", "AVG", "PROJECTION", "REFORMATTED", "MPR", "CPR", "CURVED", "VRT", "VR", "SSD", "RENDER",
     "RENDERED", "RENDERING",
@@ -105,7 +106,10 @@ class DicomSlice:
 
 @dataclass(eq=False)
 class Series:
-    """The slices of one SeriesInstanceUID, or of several that were joined, in file order. The UIDs and the ID are the patient's (PHI), and are never shown."""
+    """The slices of one SeriesInstanceUID, or of several that were joined, in file order.
+
+    The UIDs and the ID are the patient's (PHI), and are never shown.
+    """
 
     uid: str
     number: str
@@ -192,7 +196,9 @@ def read_headers(
 
 
 def _leave_out_projections(series: Series) -> None:
-    """Take images that were computed from the slices, such as MIP slabs, out of them; a series of one kind stays as it is."""
+    """Take images that were computed from the slices, such as MIP slabs, out of them; a series of one kind
+    stays as it is.
+    """
     slices = [one for one in series.slices if not one.computed]
     computed = [one for one in series.slices if one.computed]
     if not slices or not computed:
@@ -202,12 +208,15 @@ def _leave_out_projections(series: Series) -> None:
         return
     words = ", ".join(sorted(frozenset().union(*(one.computed for one in computed))))
     series.faults.append(
-        f"{len(slices)} slices and {len(computed)} images computed from slices ({words}) are in one series; expected one kind"
+        f"{len(slices)} slices and {len(computed)} images computed from slices ({words}) are in one "
+        "series; expected one kind"
     )
 
 
 def _is_page(header: Dataset) -> bool:
-    """Whether an image is no slice: a screen save, a dose report, in colours, with burned-in text, or without a place in the patient."""
+    """Whether an image is no slice: a screen save, a dose report, in colours, with burned-in text, or
+    without a place in the patient.
+    """
     places = "ImagePositionPatient", "ImageOrientationPatient", "NumberOfFrames"
     try:
         if PAGES.intersection(map(str, header.get("ImageType") or [])):
@@ -268,14 +277,16 @@ def _slice(
         raise PatientError(f"{item.name}: is a screen save or a report; expected a slice")
     if kind & NOT_HU:
         raise PatientError(
-            f"{item.name}: its pixels are {', '.join(sorted(kind & NOT_HU))}; expected HU; give the CT that it was made from"
+            f"{item.name}: its pixels are {', '.join(sorted(kind & NOT_HU))}; expected HU; give the CT that "
+            "it was made from"
         )
     row, column = _orientation(item, value("ImageOrientationPatient"))
     vertical, horizontal = _numbers(item, "PixelSpacing", value("PixelSpacing"), 2)
     rows, columns = _whole(item, header, "Rows") or 0, _whole(item, header, "Columns") or 0
     if min(vertical, horizontal) <= 0 or not 2 <= rows * columns <= MOST_PIXELS:
         raise PatientError(
-            f"{item.name}: Columns, Rows and PixelSpacing are those of {columns} x {rows} pixels of {horizontal:g} x {vertical:g} mm; "
+            f"{item.name}: Columns, Rows and PixelSpacing are those of {columns} x {rows} pixels of "
+            f"{horizontal:g} x {vertical:g} mm; "
             "expected more than 0 of each"
         )
     slope, intercept = (
@@ -339,7 +350,8 @@ def _orientation(item: SourceFile, given: Any) -> tuple[np.ndarray, np.ndarray]:
     lengths = np.linalg.norm(both, axis=1)
     if np.abs(lengths - 1).max() > 0.01 or abs(both[0] @ both[1]) > 0.01:
         raise PatientError(
-            f"{item.name}: ImageOrientationPatient is {', '.join(f'{n:g}' for n in both.ravel())}; expected two orthogonal unit vectors"
+            f"{item.name}: ImageOrientationPatient is {', '.join(f'{n:g}' for n in both.ravel())}; expected "
+            "two orthogonal unit vectors"
         )
     row = both[0] / lengths[0]
     column = both[1] - (both[1] @ row) * row

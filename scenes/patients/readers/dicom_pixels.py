@@ -16,7 +16,10 @@ from scenes.volumes.lazy_volume import AIR_HU, LEAST_HU, MOST_HU
 
 
 def hounsfield(slices: Iterable[DicomSlice]) -> Iterator[np.ndarray]:
-    """HU (rows, columns) int16 of each slice; padding becomes air. Raises PatientError that names the file."""
+    """HU (rows, columns) int16 of each slice; padding becomes air.
+
+    Raises PatientError that names the file.
+    """
     for item, of_file in groupby(slices, key=lambda one: one.item):
         data, by_gdcm = item.parsed(), None
         _check_length(item, data)
@@ -36,14 +39,17 @@ def hounsfield(slices: Iterable[DicomSlice]) -> Iterator[np.ndarray]:
                         values[_padded(raw, one.padding)] = AIR_HU
             if values.shape != (one.rows, one.columns):
                 raise PatientError(
-                    f"{item.name}: it has pixels of shape {values.shape}; expected {(one.rows, one.columns)}, as in its header; export it "
+                    f"{item.name}: it has pixels of shape {values.shape}; expected "
+                    f"{(one.rows, one.columns)}, as in its header; export it "
                     "again"
                 )
             yield np.clip(np.rint(values), LEAST_HU, MOST_HU).astype(np.int16)
 
 
 def _check_length(item: SourceFile, data: Dataset) -> None:
-    """Raises PatientError where uncompressed pixels are a row or column too many: of other Columns every row would be shifted."""
+    """Raises PatientError where uncompressed pixels are a row or column too many: of other Columns every
+    row would be shifted.
+    """
     syntax = data.file_meta.get("TransferSyntaxUID")
     if syntax is None or not syntax.is_transfer_syntax or syntax.is_encapsulated or "PixelData" not in data:
         return
@@ -57,7 +63,8 @@ def _check_length(item: SourceFile, data: Dataset) -> None:
         pixels, of_pixel = rows * columns * int(data.get("NumberOfFrames") or 1), int(data.BitsAllocated) // 8
     if len(data.PixelData) >= of_pixel * (pixels + min(rows, columns)):
         raise PatientError(
-            f"{item.name}: PixelData has {len(data.PixelData)} bytes; expected {of_pixel * pixels}, by its Rows, Columns, BitsAllocated "
+            f"{item.name}: PixelData has {len(data.PixelData)} bytes; expected {of_pixel * pixels}, by its "
+            "Rows, Columns, BitsAllocated "
             "and NumberOfFrames; export it again"
         )
 

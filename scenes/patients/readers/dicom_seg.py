@@ -43,7 +43,8 @@ def read_segmentation(
         progress: shows the progress of the segments.
 
     Raises:
-        PatientError: damaged, not in the patient's coordinates, or of a transfer syntax that nothing here decodes.
+        PatientError: damaged, not in the patient's coordinates, or of a transfer syntax that nothing here
+        decodes.
     """
     logging.getLogger("highdicom").setLevel(logging.ERROR)
     data = item.parsed()
@@ -53,7 +54,8 @@ def read_segmentation(
     _decode(item, data)
     with parsing(
         f"{item.name}: cannot be read as a DICOM segmentation",
-        "expected evenly spaced frames in the patient's coordinates; export it as a label map, for example NRRD",
+        "expected evenly spaced frames in the patient's coordinates; export it as a label map, for "
+        "example NRRD",
     ):
         _complete(item, data)
         shift = _reduce(data)
@@ -77,7 +79,9 @@ def read_segmentation(
 
 
 def _decode(item: SourceFile, data: Dataset) -> None:
-    """Complete the description of pixels, and replace frames that highdicom cannot read: big endian ones, and single bits that are compressed as bytes."""
+    """Complete the description of pixels, and replace frames that highdicom cannot read: big endian ones,
+    and single bits that are compressed as bytes.
+    """
     for name, value in ALWAYS.items():
         if data.get(name) is None:
             setattr(data, name, value)
@@ -123,7 +127,10 @@ def _undecoded(item: SourceFile, data: Dataset) -> str:
 
 
 def _complete(item: SourceFile, data: Dataset) -> None:
-    """Give frames in the patient's coordinates what highdicom requires, and writers or anonymisers leave out. Raises PatientError for others."""
+    """Give frames in the patient's coordinates what highdicom requires, and writers or anonymisers leave out.
+
+    Raises PatientError for others.
+    """
     frames = data.PerFrameFunctionalGroupsSequence
     if not data.get("NumberOfFrames"):
         data.NumberOfFrames = len(frames)
@@ -133,7 +140,8 @@ def _complete(item: SourceFile, data: Dataset) -> None:
     planes = [group.PlaneOrientationSequence[0] for group in groups if group.get("PlaneOrientationSequence")]
     if not any("ImageOrientationPatient" in plane for plane in planes):
         raise PatientError(
-            f"{item.name}: has no ImageOrientationPatient, so it belongs to no volume; expected labels of a CT; choose another file"
+            f"{item.name}: has no ImageOrientationPatient, so it belongs to no volume; expected labels of a "
+            "CT; choose another file"
         )
     for name in ("FrameOfReferenceUID", "StudyInstanceUID"):
         if not data.get(name):
@@ -145,7 +153,8 @@ def _complete(item: SourceFile, data: Dataset) -> None:
 
 
 def _reduce(data: Dataset) -> int:
-    """Leave only what voxels and their places need, so that nothing else has to be there. Segments are described by plain codes.
+    """Leave only what voxels and their places need, so that nothing else has to be there. Segments are
+    described by plain codes.
 
     Returns:
         What was added to the numbers of segments, as highdicom's are from 1.
@@ -199,7 +208,8 @@ def _segments(item: SourceFile, data: Dataset) -> list[Segment]:
     for segment in described:
         if segment.value == 0 and segment.is_understood and data.get("PixelPaddingValue") != 0:
             raise PatientError(
-                f"{item.name}: SegmentNumber of segment {segment} is 0, which is the background of a label map; expected numbers from 1; "
+                f"{item.name}: SegmentNumber of segment {segment} is 0, which is the background of a label "
+                "map; expected numbers from 1; "
                 "number the segments and their voxels from 1, or export it as a binary segmentation"
             )
     return [segment for segment in described if segment.value != 0]
@@ -212,7 +222,9 @@ def _maps(
     shift: int,
     progress: Progress,
 ) -> tuple[list[LabelMap], VoxelGrid | None]:
-    """The maps of the segments that are not empty, and the grid of all frames; ``shift`` is as ``_reduce`` returns it."""
+    """The maps of the segments that are not empty, and the grid of all frames; ``shift`` is as ``_reduce``
+    returns it.
+    """
     is_upright = segmentation.get_volume_geometry(allow_missing_positions=True) is not None
     read = _upright if is_upright else _tilted
     maps, whole = [], None

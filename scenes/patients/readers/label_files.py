@@ -1,4 +1,6 @@
-"""Read labels: label maps, folders with one file per organ, 3D Slicer's .seg.nrrd, DICOM-SEG, RTSTRUCT, surfaces."""
+"""Read labels: label maps, folders with one file per organ, 3D Slicer's .seg.nrrd, DICOM-SEG, RTSTRUCT,
+surfaces.
+"""
 
 import re
 from collections.abc import Callable, Collection
@@ -56,7 +58,8 @@ def open_labels(
     """Read labels.
 
     Args:
-        path: a label map or .seg.nrrd file, a surface, a folder with one file per organ, a DICOM-SEG or RTSTRUCT, or a
+        path: a label map or .seg.nrrd file, a surface, a folder with one file per organ, a DICOM-SEG or
+        RTSTRUCT, or a
             folder or archive with one of these.
         wanted: names or values of segments, or files of a folder, to read, whatever their names.
         progress: shows the progress of headers, files and contours.
@@ -78,7 +81,8 @@ def open_labels(
         return of_files
     if not find_dicom_files(path):
         raise PatientError(
-            f"{path}: has no labels; expected a label map, one file for each organ, a DICOM segmentation or structure set, or surfaces; "
+            f"{path}: has no labels; expected a label map, one file for each organ, a DICOM segmentation or "
+            "structure set, or surfaces; "
             "choose another"
         )
     contents = read_dicom_headers(path, progress)
@@ -88,7 +92,8 @@ def open_labels(
         a_ct = f", but {slices} CT slices" if slices else ""
         order = "give the CT first, then the labels" if slices else "choose another"
         raise PatientError(
-            f"{path}: has no labels{a_ct}; expected a DICOM segmentation or structure set, or label maps; {order}"
+            f"{path}: has no labels{a_ct}; expected a DICOM segmentation or structure set, or label maps; "
+            f"{order}"
         )
     return found
 
@@ -96,7 +101,10 @@ def open_labels(
 def _files_of_folder(
     folder: Path, wanted: Collection[str], progress: Progress, space: Space | None
 ) -> Segmentation | None:
-    """The label maps of a folder, or its surfaces, one per organ; None without either. Raises PatientError."""
+    """The label maps of a folder, or its surfaces, one per organ; None without either.
+
+    Raises PatientError.
+    """
     entries = entries_of(folder) if folder.is_dir() else []
     surfaces = [file for file in entries if is_surface_file(file)]
     if organ_files := [file for file in entries if is_volume_file(file)]:
@@ -123,7 +131,10 @@ def segmentation_of(
     progress: Progress = silent,
     belongs: Belongs = lambda references: True,
 ) -> Segmentation | None:
-    """The segmentation among DICOM files that belongs to the CT, or None where there is none at all. Raises PatientError."""
+    """The segmentation among DICOM files that belongs to the CT, or None where there is none at all.
+
+    Raises PatientError.
+    """
     if len(contents.labels) < 2:
         return next((_read_dicom(kind, item, wanted, progress) for kind, item in contents.labels), None)
     headers = [label_header(kind, item) for kind, item in contents.labels]
@@ -136,7 +147,8 @@ def segmentation_of(
     names = ", ".join(header.item.name for header in (own or headers)[:6])
     choice = "choose the patient's CT with --series, or " if patients > 1 else ""
     raise PatientError(
-        f"{len(own or headers)} segmentations and structure sets{of_patients} were found: {names}; expected one; {choice}give its file "
+        f"{len(own or headers)} segmentations and structure sets{of_patients} were found: {names}; "
+        f"expected one; {choice}give its file "
         "as LABELS"
     )
 

@@ -49,7 +49,10 @@ def label_header(kind: str, item: SourceFile) -> LabelHeader:
 
 
 def references_of(data: Dataset) -> DicomReferences:
-    """What labels refer to. Of a structure set the frames are those of its regions; what cannot be read counts as absent."""
+    """What labels refer to.
+
+    Of a structure set the frames are those of its regions; what cannot be read counts as absent.
+    """
     found = set(_uids(data, LEADING))
     if not any(kind == "instances" and uid for kind, uid in found):
         found |= {(kind, uid) for kind, uid in _uids(data, OF_EACH) if kind == "instances"}

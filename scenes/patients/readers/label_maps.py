@@ -62,7 +62,8 @@ class Segment:
         sides |= codes.sides
         if len(sides) > 1:
             raise PatientError(
-                f"{file}: segment {named} has the codes {codes}, which are of another side than its name or than each other; "
+                f"{file}: segment {named} has the codes {codes}, which are of another side than its name or "
+                "than each other; "
                 "expected one side; correct the segment's name or terminology, for example in 3D Slicer"
             )
         side = next(iter(sides), None)
@@ -143,7 +144,9 @@ class Segmentation:
 
 
 def is_left_out(segment: Segment, wanted: Collection[str], is_tissue: bool = True) -> bool:
-    """Whether a segment is not read: it is no tissue, far from the kidneys or the body's outline, and no ``wanted`` name or value."""
+    """Whether a segment is not read: it is no tissue, far from the kidneys or the body's outline, and no
+    ``wanted`` name or value.
+    """
     needless = not is_tissue or is_needless(segment.name)
     return needless and not any(segment.matches(word) for word in wanted)
 
@@ -164,7 +167,8 @@ def whole_numbers(voxels: np.ndarray, name: str) -> np.ndarray:
     low, high = voxels.min(), voxels.max()
     if low < 0 or high > 65535 or (voxels.dtype.kind == "f" and (voxels != np.rint(voxels)).any()):
         raise PatientError(
-            f"{name}: has values from {low:g} to {high:g}; expected whole numbers from 0 up; check that CT and "
+            f"{name}: has values from {low:g} to {high:g}; expected whole numbers from 0 up; check that CT "
+            "and "
             "labels are not exchanged and that the map is not a probability"
         )
     if high == 0:
@@ -181,7 +185,9 @@ def present_values(values: np.ndarray) -> list[int]:
 
 
 def among(voxels: np.ndarray, wanted: Sequence[int]) -> np.ndarray:
-    """Whether each voxel has one of the wanted values; plane by plane, as np.isin takes three times the memory."""
+    """Whether each voxel has one of the wanted values; plane by plane, as np.isin takes three times the
+    memory.
+    """
     found = np.empty(voxels.shape, bool)
     for plane, inside in zip(voxels, found, strict=True):
         inside[:] = np.isin(plane, wanted)

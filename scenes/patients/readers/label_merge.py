@@ -1,4 +1,6 @@
-"""Merge label maps that may overlap into one: small structures cover their surroundings, and what the user named is whole."""
+"""Merge label maps that may overlap into one: small structures cover their surroundings, and what the user
+named is whole.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -9,15 +11,21 @@ from scenes.patients.readers.label_maps import LESIONS, LabelMap, Segment, prese
 from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 # Of overlapping segments, later tissues cover earlier ones: small structures cover their surroundings.
-MERGE_ORDER = (None, "soft-tissue", "fat", "fascia", "muscle", "perimysium", "bone", "liver", "spleen", "bowel", "gas", "fluid", "kidney", "cortex", "medulla", "arcuate", "sinus", "vessel", "vein", "artery", "urine", "cyst", "tumour", "pseudocapsule", "necrosis", "stone", "metal")  # fmt: skip
+MERGE_ORDER = (
+    None, "soft-tissue", "fat", "fascia", "muscle", "perimysium", "bone", "liver", "spleen", "bowel",
+    "gas", "fluid", "kidney", "cortex", "medulla", "arcuate", "sinus", "vessel", "vein", "artery",
+    "urine", "cyst", "tumour", "pseudocapsule", "necrosis", "stone", "metal",
+)  # fmt: skip
 
 
 def merge_label_maps(maps: list[LabelMap], organ: Sequence[str] = ()) -> tuple[LabelMap, list[int] | None]:
-    """Merge maps that may overlap and have different grids, on the grid of the first with a kidney, extended to cover all.
+    """Merge maps that may overlap and have different grids, on the grid of the first with a kidney, extended
+    to cover all.
 
     Args:
         maps: one or more.
-        organ: names or values of the segments that the user gave as the organ: they are the organ alone, whatever covers them.
+        organ: names or values of the segments that the user gave as the organ: they are the organ alone,
+        whatever covers them.
 
     Returns:
         The merged map, and the values of the named organ; None where none is named.
@@ -44,7 +52,9 @@ def merge_label_maps(maps: list[LabelMap], organ: Sequence[str] = ()) -> tuple[L
 
 
 def _is_named(segment: Segment, organ: Sequence[str]) -> bool:
-    """Whether the user gave a segment as the organ; a tumour or cyst that is given as both is a part of it."""
+    """Whether the user gave a segment as the organ; a tumour or cyst that is given as both is a part of
+    it.
+    """
     return segment.tissue not in LESIONS and any(segment.matches(word) for word in organ)
 
 
@@ -56,7 +66,9 @@ def _is_main(one: LabelMap, organ: Sequence[str]) -> bool:
 def _own_values(
     values: np.ndarray, segments: dict[int, Segment], named: np.ndarray, organ: Sequence[str]
 ) -> list[int]:
-    """The values of the named organ (z, y, x); what covers a part of it, but for lesions, gets a value of its own there."""
+    """The values of the named organ (z, y, x); what covers a part of it, but for lesions, gets a value of
+    its own there.
+    """
     own = [code for code, segment in segments.items() if any(segment.matches(word) for word in organ)]
     covered = {
         code

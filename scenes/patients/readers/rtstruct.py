@@ -37,7 +37,8 @@ def read_structures(
 ) -> Segmentation:
     """The regions of a structure set, which are filled once the CT's grid is known.
 
-    Outlines of the body, couches and structures far from the kidneys are left out, except where they are wanted.
+    Outlines of the body, couches and structures far from the kidneys are left out, except where they are
+    wanted.
 
     Args:
         item: the file.
@@ -58,7 +59,8 @@ def read_structures(
     references = references_of(data)
     if len(references.frames) > 1:
         raise PatientError(
-            f"{item.name}: its regions are in {len(references.frames)} frames of reference; expected one; export the regions of one CT"
+            f"{item.name}: its regions are in {len(references.frames)} frames of reference; expected one; "
+            "export the regions of one CT"
         )
     empty = tuple(region.segment for region in regions if not region.contours)
     notes = (*note_of_left_out(left_out), *_note_of_empty(empty))
@@ -150,6 +152,8 @@ def _kind(contour: Dataset) -> str:
 
 
 def _points(contour: Dataset) -> np.ndarray:
-    """Points (n, 3) of a contour; pydicom converts each number to an object, which takes ten times as long."""
+    """Points (n, 3) of a contour; pydicom converts each number to an object, which takes ten times as
+    long.
+    """
     value = contour.get_item("ContourData").value
     return np.array(value.split(b"\\") if isinstance(value, bytes) else value, float).reshape(-1, 3)

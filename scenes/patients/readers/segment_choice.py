@@ -1,4 +1,6 @@
-"""Which segments are which tissue: by the user's words, by their names, and not at all where a name is of a derived structure."""
+"""Which segments are which tissue: by the user's words, by their names, and not at all where a name is of
+a derived structure.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -8,8 +10,8 @@ from errors import PatientError
 from scenes.patients.readers.label_maps import LESIONS, LabelMap, Segment, listed, resample_nearest
 from scenes.patients.readers.segment_names import is_derived, is_plain_kidney, quoted, same_name
 
-# Segments of one tissue that have this share of the larger in common are the same structure, drawn twice. A smaller one with this share of
-# its own in a kidney is something in it.
+# Segments of one tissue that have this share of the larger in common are the same structure, drawn twice. A
+# smaller one with this share of its own in a kidney is something in it.
 SAME_STRUCTURE, WITHIN = 0.4, 0.5
 
 
@@ -21,8 +23,8 @@ def assign_tissues(
 ) -> list[LabelMap]:
     """The maps with the tissues that the user assigned, by names or values.
 
-    A label given as the organ and as a tissue is the tissue. A tissue's value, or its segment in ``empty``, may be absent
-    (``absent_labels``), so that one command is right for many patients.
+    A label given as the organ and as a tissue is the tissue. A tissue's value, or its segment in ``empty``,
+    may be absent (``absent_labels``), so that one command is right for many patients.
 
     Args:
         maps: all label maps.
@@ -31,7 +33,8 @@ def assign_tissues(
         empty: segments of the files that no voxel has.
 
     Raises:
-        PatientError: an absent label of the organ, a name that no segment has, or one segment given as two tissues.
+        PatientError: an absent label of the organ, a name that no segment has, or one segment given as two
+        tissues.
     """
     segments = _segments(maps)
     for word in [*organ, *(word for words in chosen.values() for word in words)]:
@@ -45,7 +48,8 @@ def assign_tissues(
             )
             if not may_be_absent and not _is_among(segments, word):
                 raise PatientError(
-                    f"the {_in_words(option)}'s label {word} is not in the label map: it has {listed([str(s) for s in segments])}; "
+                    f"the {_in_words(option)}'s label {word} is not in the label map: it has "
+                    f"{listed([str(s) for s in segments])}; "
                     "give one of these"
                 )
 
@@ -53,7 +57,8 @@ def assign_tissues(
         found = [tissue for tissue, words in chosen.items() if any(segment.matches(word) for word in words)]
         if len(found) > 1:
             raise PatientError(
-                f"label {segment} is given as {' and as '.join(map(_in_words, found))}: give it as one of them"
+                f"label {segment} is given as {' and as '.join(map(_in_words, found))}: give it as one of "
+                "them"
             )
         if found:
             return replace(segment, tissue=found[0])
@@ -66,16 +71,20 @@ def assign_tissues(
 
 
 def _check_unambiguous(word: str, segments: Sequence[Segment]) -> None:
-    """Raises PatientError where a word is the name of one segment and the value of another, or of names that differ in case alone."""
+    """Raises PatientError where a word is the name of one segment and the value of another, or of names
+    that differ in case alone.
+    """
     named = [segment for segment in segments if same_name(word, segment.name)]
     valued = [segment for segment in segments if word == str(segment.value) and segment not in named]
     if named and valued:
         raise PatientError(
-            f"{quoted(word)} is the name of label {named[0]} and the value of label {valued[0]}; expected one meaning; rename one of them"
+            f"{quoted(word)} is the name of label {named[0]} and the value of label {valued[0]}; expected "
+            "one meaning; rename one of them"
         )
     if len({segment.name for segment in named}) > 1:
         raise PatientError(
-            f"{quoted(word)} is the name of {len(named)} labels, which differ in case alone: {_listed(named)}; give a value, or rename one"
+            f"{quoted(word)} is the name of {len(named)} labels, which differ in case alone: "
+            f"{_listed(named)}; give a value, or rename one"
         )
 
 
@@ -108,9 +117,10 @@ def choose_segments(
 ) -> tuple[list[LabelMap], tuple[str, ...]]:
     """The maps without segments that are no organ, and notes that name these.
 
-    Derived structures are left out, and so is a kidney that is drawn a second time under a longer name. Other segments that are one
-    structure drawn twice, such as two observers', are united when the maps are merged: a note names them. A small segment in a kidney whose
-    name has the word kidney and others is a finding of no known tissue.
+    Derived structures are left out, and so is a kidney that is drawn a second time under a longer name. Other
+    segments that are one structure drawn twice, such as two observers', are united when the maps are merged:
+    a note names them. A small segment in a kidney whose name has the word kidney and others is a finding of
+    no known tissue.
 
     Args:
         maps: with the tissues that the user assigned.
@@ -129,7 +139,8 @@ def choose_segments(
     notes = []
     if derived:
         notes.append(
-            f"left out, as derived from other structures: {_listed(derived)}; --organ or --tumour with its name takes one"
+            f"left out, as derived from other structures: {_listed(derived)}; --organ or --tumour with its "
+            "name takes one"
         )
     if twice.copies:
         names = _listed([*dict.fromkeys(twice.copies)])
@@ -138,7 +149,8 @@ def choose_segments(
     kept = _without(maps, [*derived, *twice.copies], twice.findings)
     if not kept:
         raise PatientError(
-            f"the labels are only of structures that were derived from others: {_listed(derived)}; expected a kidney; choose other labels, "
+            f"the labels are only of structures that were derived from others: {_listed(derived)}; expected "
+            "a kidney; choose other labels, "
             "or name the kidney's with --organ"
         )
     return kept, tuple(notes)
@@ -186,7 +198,9 @@ def _drawn_twice(maps: list[LabelMap], words: Collection[str], is_organ_named: b
 def _shares_in_common(
     one: LabelMap, value: int, other: LabelMap, other_value: int
 ) -> tuple[float, float, bool]:
-    """The share of the larger and of the smaller of two segments that both cover, and whether the first is smaller."""
+    """The share of the larger and of the smaller of two segments that both cover, and whether the first is
+    smaller.
+    """
     (low, high), (other_low, other_high) = one.grid.bounds(), other.grid.bounds()
     if (low > other_high).any() or (other_low > high).any():
         return 0.0, 0.0, False
@@ -199,7 +213,9 @@ def _shares_in_common(
 def _without(
     maps: list[LabelMap], left_out: Sequence[Segment], findings: Sequence[Segment]
 ) -> list[LabelMap]:
-    """The maps without those of segments that are left out; beside others in a map these have no tissue, as findings have none."""
+    """The maps without those of segments that are left out; beside others in a map these have no tissue,
+    as findings have none.
+    """
     kept = []
     for one in maps:
         segments = {
@@ -212,7 +228,9 @@ def _without(
 
 
 def with_commas(words: Sequence[str], maps: list[LabelMap], empty: Sequence[Segment] = ()) -> list[str]:
-    """The user's words, which a list was split into at its commas, joined again where a segment's name has commas."""
+    """The user's words, which a list was split into at its commas, joined again where a segment's name has
+    commas.
+    """
     joined = list(words)
     for segment in [*_segments(maps), *empty]:
         parts = [part.strip() for part in segment.name.split(",")]

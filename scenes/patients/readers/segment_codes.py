@@ -1,4 +1,6 @@
-"""Recognise the tissue and the side of a segment by its codes, in 3D Slicer's terminology entries and in DICOM."""
+"""Recognise the tissue and the side of a segment by its codes, in 3D Slicer's terminology entries and in
+DICOM.
+"""
 
 import re
 from collections.abc import Iterable
@@ -8,8 +10,8 @@ from pydicom.dataset import Dataset
 
 from scenes.patients.readers.segment_names import Side, is_understood, side_of, tissue_of
 
-# Words, as names have them, of codes of SNOMED CT, whatever the language of their meaning. pydicom knows which codes of SNOMED RT are
-# the same.
+# Words, as names have them, of codes of SNOMED CT, whatever the language of their meaning. pydicom knows
+# which codes of SNOMED RT are the same.
 WORDS = {
     "64033007": "kidney", "18639004": "left kidney", "9846003": "right kidney", "50403003": "renal cortex",
     "30737000": "renal medulla", "25990002": "renal pelvis", "2334006": "calyx", "87953007": "ureter",
@@ -42,7 +44,9 @@ class CodedMeaning:
 
     @property
     def tissue(self) -> str | None:
-        """The tissue, or None: a general type, such as tissue, is that of the region; a lesion of another organ is not modelled."""
+        """The tissue, or None: a general type, such as tissue, is that of the region; a lesion of another
+        organ is not modelled.
+        """
         if not is_understood(self.kind):
             return tissue_of(self.region)
         tissue = tissue_of(self.kind)
@@ -59,7 +63,9 @@ class CodedMeaning:
 
 
 def slicer_meaning(tags: str) -> CodedMeaning:
-    """The meaning of the terminology entry in a segment's tags, as 3D Slicer writes them; empty where there is none."""
+    """The meaning of the terminology entry in a segment's tags, as 3D Slicer writes them; empty where
+    there is none.
+    """
     entry = TERMINOLOGY_ENTRY.search(tags)
     fields = [field.split("^") for field in entry[1].split("~")] if entry else []
     words = [_words(*field) if len(field) == 3 else "" for field in fields]

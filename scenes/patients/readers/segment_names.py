@@ -1,4 +1,6 @@
-"""Recognise the tissue and the side of a segment by its name, and structures that are derived from others for planning."""
+"""Recognise the tissue and the side of a segment by its name, and structures that are derived from others
+for planning.
+"""
 
 import re
 import unicodedata
@@ -8,16 +10,19 @@ from scenes.tissue_classes.tissue_map import TISSUES
 
 Side = Literal["left", "right"]
 
-# Patterns are for plain names (``_plain``): lower case, without accents, one space between words. The first match counts: a renal mass is a
-# tumour and a kidney cyst a cyst, not a kidney. "": a known structure that is not modelled. English, and the words of German, French,
+# Patterns are for plain names (``_plain``): lower case, without accents, one space between words. The first
+# match counts: a renal mass is a tumour and a kidney cyst a cyst, not a kidney. "": a known structure that is
+# not modelled. English, and the words of German, French,
 # Spanish, Italian, Portuguese, Dutch, Chinese and Japanese that segments are commonly named with.
 TISSUE_OF_NAME: tuple[tuple[str, str], ...] = (
-    ("", r"adrenal|suprarenal|gall ?bladder|cystic duct|spleen|splen|milz|\bbazo\b|pancrea|stomach|colon|bowel|duoden|intestin|diaphragm|lymph(?!om)|skin|\bbody\b|external"),
+    ("", r"adrenal|suprarenal|gall ?bladder|cystic "
+         r"duct|spleen|splen|milz|\bbazo\b|pancrea|stomach|colon|bowel|duoden|intestin|diaphragm|lymph(?!om)|skin|\bbody\b|external"),
     ("tumour", r"tum(o|ou|eu)r|\bmass(es|e|a)?\b|\bmasas?\b|raumforderung|l(e|a|ae)sion|lesao|lesoes|laesie|neoplas|neoform|neubild|geschwulst|carcino|karzin|cancer|cancro|krebs|malign|"
                r"sar[ck]om|blastom|lymphom|metasta|adenom|nodul|knoten|nephrom|angiomyolip|\bamls?\b|on[ck]o[cz]yt|\b(cc|p|ch|nc)?rcc\b|\bgtv|肿瘤|腫瘍|腫瘤|肿块"),
     ("cyst", r"\bcysts?\b|zyste|\bkystes?\b|\bquistes?\b|\bcisti\b|\bcistos?\b|\bcysten?\b|bosniak|囊肿|嚢胞"),
     ("stone", r"\bstones?\b|calcul|lithiasis|litiasi|nierenstein|\bpiedras?\b|结石|結石"),
-    ("urine", r"collecting|(kidney|renal) pelvis|pelvis (kidney|renal|of the kidney)|pelvi renal|pelvical|caly[xc]|calic|ureter|urinary|urine|pyelo|bassinet|nierenbecken|kelch|harn|输尿管|尿管|肾盂|腎盂"),
+    ("urine", r"collecting|(kidney|renal) pelvis|pelvis (kidney|renal|of the kidney)|pelvi "
+            r"renal|pelvical|caly[xc]|calic|ureter|urinary|urine|pyelo|bassinet|nierenbecken|kelch|harn|输尿管|尿管|肾盂|腎盂"),
     ("vessel", r"arter(y|ies|ia)? (and|or|und|et) |vessel|vaisseau|gefa(e|s)?s|vascul|血管"),
     ("artery", r"arter|aorta|动脉|動脈"),
     ("vein", r"\bveins?\b|\bvenen?\b|nierenvene|\bvenas?\b|\bveine|\bveias?\b|venous|\bivc\b|静脉|静脈"),
@@ -25,7 +30,8 @@ TISSUE_OF_NAME: tuple[tuple[str, str], ...] = (
     ("cortex", r"renal cortex|kidney cortex|cortex of (the )?kidney"),
     ("sinus", r"(kidney|renal) sinus|sinus (fat|renal|of the kidney)|nierensinus"),
     ("fat", r"(peri|para)(renal|nephric) fat"),
-    ("", r"fascia|gerota|(peri|para)(renal|nephr)|(kidney|renal|nephrectomy) (bed|capsule|hilum|hilus|space)\b"),
+    ("", r"fascia|gerota|(peri|para)(renal|nephr)|(kidney|renal|nephrectomy) "
+         r"(bed|capsule|hilum|hilus|space)\b"),
     ("kidney", r"kidneys?\b|\brenal\b|\bren\b|\brene\b|\breni\b|\brenes\b|\bniere|\bnier\b|\breins?\b|\brinon(es)?\b|\brim (direito|esquerdo)\b|\brins\b|肾|腎"),
     ("liver", r"\bliver\b|hepat|\bleber\b|\bfoie\b|\bhigado\b|\bfigado\b|\bfegato\b|肝"),
     ("bone", r"vertebr|\bribs?\b|\bbones?\b|\bspine\b|sacrum|\bhip\b|femur|sternum|scapula|humerus|clavicula|costal|knochen|wirbel"),
@@ -37,16 +43,19 @@ OWN_NAMES = {tissue.replace("-", " "): tissue for tissue in TISSUES}
 # Structures of TotalSegmentator that are too far from a kidney to be in its image.
 FAR = (
     r"brain|skull|\bface\b|heart|atri(um|al)|ventric|myocard|lung|pulmon|humerus|clavic|scapula|femur|sacrum|\bhips?\b|"
-    r"vertebrae (c\d|t[1-8]\b)|rib (left|right) [1-7]\b|trachea|(o|oe)?esophagus|thyroid|prostate|bladder|gluteus|"
+    r"vertebrae (c\d|t[1-8]\b)|rib (left|right) "
+    r"[1-7]\b|trachea|(o|oe)?esophagus|thyroid|prostate|bladder|gluteus|"
     r"brachiocephal|subclavian|carotid|sternum|costal|spinal cord|iliac (artery|vena)"
 )
 # What encloses or carries the patient, and is no organ.
 OUTLINE = (
-    r"^(whole |outer )?(body|skin|patient|external|outline|contour)( (contour|outline|surface|skin))?( \d+)?$|couch|"
+    r"^(whole |outer )?(body|skin|patient|external|outline|contour)( "
+    r"(contour|outline|surface|skin))?( \d+)?$|couch|"
     r"\btable ?(top)?$|^mattress"
 )
-# Structures that are derived from others by a margin or for the planning of a treatment, as TG-263 (doi 10.1016/j.ijrobp.2017.12.013) and
-# its users name them, and by the atlas of a class image: PRV, CTV, PTV, ITV, a "z" before the name for optimisation, "~" for a part. A GTV is the tumour itself.
+# Structures that are derived from others by a margin or for the planning of a treatment, as TG-263 (doi
+# 10.1016/j.ijrobp.2017.12.013) and its users name them, and by the atlas of a class image: PRV, CTV, PTV,
+# ITV, a "z" before the name for optimisation, "~" for a part. A GTV is the tumour itself.
 DERIVED = (
     r"\b(prv|(i ?)?[cp]tv|itv|i ?gtv)|bounding box|normal tissue|"
     r"\b(ring|rind|opt(i|im|imi[sz]\w+)?|margins?|bbox|exp(and\w*|ansion)?|dil(at\w+)?|ero(ded|sion)|shr[iu]nk\w*|grow\w*|shell|hull|halo|"
@@ -55,7 +64,8 @@ DERIVED = (
 DERIVED_SIGNS = r"^z(?=[A-Z_ ])|^_|~|\(drawn\)$|\+\s*\d|-\s*\d+([.,]\d+)?\s*(mm|cm)\b"
 # Of a kidney's name: the width of a margin. Of a tumour's it is the size.
 MARGIN = r"\d ?[mc]m\b"
-# A kidney with or without its tumour, such as "Kidney_L-GTV", "kidney w/o mass", "Kidney + tumour": first the kidney, then the tumour.
+# A kidney with or without its tumour, such as "Kidney_L-GTV", "kidney w/o mass", "Kidney + tumour": first the
+# kidney, then the tumour.
 COMPOSITE = r"(?i)(.+?)(\bwith(out)?\b|\bw/o?\b|\bminus\b|\b(in|ex)cl\w*|\bohne\b|\bmit\b|\bsans\b|\bavec\b|\band\b|\bund\b|\bet\b|[+&]|\s[-–]\s|[-–](?=i?gtv))(.+)"
 # Organs whose lesions are not the kidney's, where a name has no word for a kidney.
 OTHER_ORGANS = (
@@ -105,7 +115,9 @@ PUBLIC_WORDS = frozenset(
 
 
 def tissue_of(name: str) -> str | None:
-    """The tissue of ``ultrasound/acoustic_tissues.toml`` that a name means; None where it means none, or is of a derived structure."""
+    """The tissue of ``ultrasound/acoustic_tissues.toml`` that a name means; None where it means none, or
+    is of a derived structure.
+    """
     return None if is_derived(name) else _tissue(name) or None
 
 
@@ -115,7 +127,9 @@ def is_understood(name: str) -> bool:
 
 
 def is_derived(name: str) -> bool:
-    """Whether a name is of a structure that was made from another, for example by a margin, and is no organ."""
+    """Whether a name is of a structure that was made from another, for example by a margin, and is no
+    organ.
+    """
     plain = _plain(name)
     if re.search(DERIVED, plain) or re.search(DERIVED_SIGNS, name):
         return True
@@ -128,7 +142,9 @@ def is_plain_kidney(name: str) -> bool:
 
 
 def _tissue(name: str) -> str | None:
-    """The tissue that a name means, also where it is of a derived structure; "" of a known one that is not modelled; None without."""
+    """The tissue that a name means, also where it is of a derived structure; "" of a known one that is not
+    modelled; None without.
+    """
     plain = _plain(name)
     if plain in OWN_NAMES:
         return OWN_NAMES[plain]
@@ -148,12 +164,16 @@ def is_far(name: str) -> bool:
 
 
 def is_needless(name: str) -> bool:
-    """Whether a name is of a structure that an import does not need: far from the kidneys, the body's outline, a couch."""
+    """Whether a name is of a structure that an import does not need: far from the kidneys, the body's
+    outline, a couch.
+    """
     return is_far(name) or re.search(OUTLINE, _plain(name)) is not None
 
 
 def is_public(name: str) -> bool:
-    """Whether all words of a name are of structures and sides, which identify nobody, and its digits are too few for a date or an ID."""
+    """Whether all words of a name are of structures and sides, which identify nobody, and its digits are
+    too few for a date or an ID.
+    """
     words = re.findall(r"[^\W\d_]+", _plain(name))
     digits = sum(letter.isdigit() for letter in name)
     return "^" not in name and digits < LEAST_DIGITS and all(word in PUBLIC_WORDS for word in words)
@@ -165,7 +185,9 @@ def quoted(name: str) -> str:
 
 
 def public_text(sentence: str) -> str:
-    """A sentence for a patient's folder: names in quotation marks that may be a person's are replaced by three dots."""
+    """A sentence for a patient's folder: names in quotation marks that may be a person's are replaced by
+    three dots.
+    """
     return re.sub("“([^”]*)”", lambda match: match[0] if is_public(match[1]) else WITHHELD, sentence)
 
 
@@ -185,7 +207,9 @@ def same_name(one: str, other: str) -> bool:
 
 
 def _plain(name: str) -> str:
-    """Lower case without accents, one space between words: kidneyL, kidney_L and "Kidney-L" become equal, and Läsion is lasion."""
+    """Lower case without accents, one space between words: kidneyL, kidney_L and "Kidney-L" become equal,
+    and Läsion is lasion.
+    """
     letters = "".join(c for c in unicodedata.normalize("NFKD", name) if not unicodedata.combining(c))
     apart = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", letters)
     return re.sub(r"[\W_]+", " ", apart).strip().casefold()

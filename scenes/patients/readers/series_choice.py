@@ -1,4 +1,6 @@
-"""Choose one of several CT series: by the user's word, by the labels, else the best; never silently one of several patients."""
+"""Choose one of several CT series: by the user's word, by the labels, else the best; never silently one of
+several patients.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,7 +41,8 @@ def choose_series(
         grid: the labels' own voxels, where they are a label map.
 
     Raises:
-        PatientError: no such series, or series of several patients, of which the labels show none to be theirs.
+        PatientError: no such series, or series of several patients, of which the labels show none to be
+        theirs.
     """
     if wanted is not None:
         return _wanted(path, candidates, wanted), []
@@ -56,7 +59,8 @@ def choose_series(
         what = f"CTs of {count} patients" if named else f"CTs of {count} studies, and no patient ID"
         unsure = ", and the labels do not show which" if grid or labels != NO_REFERENCES else ""
         raise PatientError(
-            f"{path}: {what}: {listed_series(candidates)}; expected one patient{unsure}; choose a series with --series, or give the "
+            f"{path}: {what}: {listed_series(candidates)}; expected one patient{unsure}; choose a series "
+            "with --series, or give the "
             "folder of one patient"
         )
     why = [REASONS[surest]] * (len(theirs) < len(ranked))
@@ -69,7 +73,8 @@ def choose_series(
         )
     of_patients = f" of {count} patients" if count > 1 else ""
     return best, [
-        f"of {len(candidates)} series{of_patients}, number {best.number} was taken: {', and '.join(why)}; there are: {listed_series(candidates)}; "
+        f"of {len(candidates)} series{of_patients}, number {best.number} was taken: "
+        f"{', and '.join(why)}; there are: {listed_series(candidates)}; "
         "--series N takes another"
     ]
 
@@ -81,7 +86,8 @@ def _wanted(path: Path, candidates: list[Series], wanted: str) -> Series:
     if len(matching) != 1:
         what = "no series" if not matching else f"{len(matching)} series"
         raise PatientError(
-            f"{path}: --series {wanted} is {what}; expected the number of one of these, or the end of its UID: {listed_series(candidates)}"
+            f"{path}: --series {wanted} is {what}; expected the number of one of these, or the end of its "
+            f"UID: {listed_series(candidates)}"
         )
     return matching[0]
 
@@ -92,7 +98,8 @@ def in_order(candidates: Sequence[Series]) -> list[Series]:
 
 
 def patient_numbers(candidates: Sequence[Series]) -> list[int]:
-    """The number of each series' patient, from 1 in the order of the series; the same PatientID is the same patient.
+    """The number of each series' patient, from 1 in the order of the series; the same PatientID is the same
+    patient.
 
     Without an ID it is the patient of the study, without that of the frame of reference.
     """
@@ -168,7 +175,9 @@ def gap_mm(series: Series) -> float | None:
 
 
 def listed_series(candidates: Sequence[Series]) -> str:
-    """Number, slices and spacing of each, and if needed the end of the UID and the patient; no free text, which may name the patient."""
+    """Number, slices and spacing of each, and if needed the end of the UID and the patient; no free text,
+    which may name the patient.
+    """
     numbers = [s.number for s in candidates]
     patients = patient_numbers(candidates)
     shown = dict(zip(candidates, patients, strict=True)) if max(patients) > 1 else {}

@@ -1,6 +1,8 @@
-"""Stack CT slices in any order into one rectangular, evenly spaced volume; missing and conflicting slices are refused.
+"""Stack CT slices in any order into one rectangular, evenly spaced volume; missing and conflicting slices are
+refused.
 
-A tilted gantry shears the stack: its slices are shifted within their planes, without interpolation between them.
+A tilted gantry shears the stack: its slices are shifted within their planes, without interpolation between
+them.
 """
 
 from collections.abc import Callable, Iterable
@@ -16,7 +18,8 @@ from scenes.patients.readers.label_maps import listed
 from scenes.volumes.lazy_volume import AIR_HU, LazyVolume
 from scenes.volumes.voxel_grid import Box, VoxelGrid
 
-# Largest deviation of a slice from the even grid, as a share of the spacing: scanners round positions to 0.1 mm at worst.
+# Largest deviation of a slice from the even grid, as a share of the spacing: scanners round positions to 0.1
+# mm at worst.
 UNEVEN = 0.1
 # In-plane shift of slices, in pixels, that is not corrected.
 SIDEWAYS = 0.25
@@ -26,12 +29,14 @@ OUT_OF_LINE = 1.0
 MOST_TILT = 45.0
 # Spacings, relative to the median, that are resampled; outside this range a slice is missing or duplicated.
 GAPS = (0.5, 1.5)
-# Neighbouring gaps within this ratio are equal, as positions are rounded; so many of them are a part of a series.
+# Neighbouring gaps within this ratio are equal, as positions are rounded; so many of them are a part of a
+# series.
 SAME_GAP, PART_FROM_GAPS = 1.25, 3
 PARALLEL = 1e-3
 SAME_PLACE_MM = 1e-3
 MOST_GAP_MM = 10.0
-# Planes of a resampled stack are closer than the closest slices only down to this: no CT resolves less, and memory grows.
+# Planes of a resampled stack are closer than the closest slices only down to this: no CT resolves less, and
+# memory grows.
 FINEST_MM = 0.5
 
 
@@ -40,7 +45,10 @@ def stack_slices(
     slices: list[DicomSlice],
     progress: Callable[[Iterable[DicomSlice]], Iterable[DicomSlice]] = iter,
 ) -> LazyVolume:
-    """One volume of slices, in HU. Raises PatientError: too few, not parallel, or one missing or in conflict."""
+    """One volume of slices, in HU.
+
+    Raises PatientError: too few, not parallel, or one missing or in conflict.
+    """
     if len(slices) < 2:
         raise PatientError(
             f"{name}: one slice only; expected a series of slices; give the folder of the whole series"
@@ -111,7 +119,8 @@ def _check_same_geometry(name: str, slices: list[DicomSlice]) -> None:
                 for one in (first, other)
             )
             raise PatientError(
-                f"{name}: {first.label} and {other.label} are of different {what}: {pixels}; expected one stack of parallel "
+                f"{name}: {first.label} and {other.label} are of different {what}: {pixels}; expected one "
+                "stack of parallel "
                 "slices; put the slices of one view in a separate folder, or export the series again"
             )
 
@@ -119,7 +128,10 @@ def _check_same_geometry(name: str, slices: list[DicomSlice]) -> None:
 def _without_duplicates(
     name: str, slices: list[DicomSlice], normal: np.ndarray, notes: list[str]
 ) -> list[DicomSlice]:
-    """Sorted slices without equal copies. Raises PatientError where slices at one position differ, or are several phases."""
+    """Sorted slices without equal copies.
+
+    Raises PatientError where slices at one position differ, or are several phases.
+    """
     groups = [[slices[0]]]
     for one in slices[1:]:
         if (one.position - groups[-1][0].position) @ normal > SAME_PLACE_MM:
@@ -132,11 +144,13 @@ def _without_duplicates(
             continue
         if len(groups) > 2 and often > 1 and len({s.sop for s in slices}) == len(slices):
             raise PatientError(
-                f"{name}: all {len(groups)} positions occur {often} times: several phases in one series; expected one; put the slices "
+                f"{name}: all {len(groups)} positions occur {often} times: several phases in one series; "
+                "expected one; put the slices "
                 "of one phase, by acquisition number or time, in a separate folder"
             )
         raise PatientError(
-            f"{name}: {first.label} and {other.label} are at one position, at {other.position @ normal:.2f} mm, and differ; expected "
+            f"{name}: {first.label} and {other.label} are at one position, at {other.position @ normal:.2f} "
+            "mm, and differ; expected "
             "each slice once; remove other phases, or the wrong copy"
         )
     copies = [copy for group in groups for copy in group[1:]]
@@ -156,7 +170,10 @@ def _same(one: DicomSlice, other: DicomSlice) -> bool:
 def _even(
     name: str, slices: list[DicomSlice], along: np.ndarray, notes: list[str]
 ) -> tuple[np.ndarray, float]:
-    """Positions of the slices on an even grid [voxels], and its spacing [mm]. Raises PatientError where one is missing or too many."""
+    """Positions of the slices on an even grid [voxels], and its spacing [mm].
+
+    Raises PatientError where one is missing or too many.
+    """
     gaps = np.diff(along)
     usual = float(np.percentile(gaps, 50, method="lower"))
     least, most = GAPS
@@ -164,34 +181,42 @@ def _even(
     is_even = least * usual <= gaps.min() and gaps.max() <= most * usual
     if parts := [] if is_even else _parts_of_one_spacing(gaps):
         described = ", then ".join(
-            f"{gaps[part].mean():.2f} mm from {slices[part.start].label} at {along[part.start]:.2f} mm to {slices[part.stop].label} at "
+            f"{gaps[part].mean():.2f} mm from {slices[part.start].label} at {along[part.start]:.2f} mm to "
+            f"{slices[part.stop].label} at "
             f"{along[part.stop]:.2f} mm"
             for part in parts
         )
         raise PatientError(
-            f"{name}: the series has {len(parts)} parts of different slice spacing: {described}; expected one spacing; put the slices of "
+            f"{name}: the series has {len(parts)} parts of different slice spacing: {described}; expected "
+            "one spacing; put the slices of "
             "the part with the organ in a separate folder, or export the series with one spacing"
         )
 
     def pair(n: int) -> str:
         (a, b), (at_a, at_b) = slices[n : n + 2], along[n : n + 2]
-        return f"{a.label} at {at_a:.2f} mm and {b.label} at {at_b:.2f} mm are {gaps[n]:.2f} mm apart, the others {usual:.2f} mm"
+        return (
+            f"{a.label} at {at_a:.2f} mm and {b.label} at {at_b:.2f} mm are {gaps[n]:.2f} mm apart, the "
+            f"others {usual:.2f} mm"
+        )
 
     if gaps.max() > most * usual:
         wide = int((gaps > most * usual).sum())
         more = f" (and {wide - 1} more such gaps)" if wide > 1 else ""
         raise PatientError(
-            f"{name}: {pair(int(np.argmax(gaps)))}{more}; expected no slice to be missing, and no gap over {most:g} times the usual; "
+            f"{name}: {pair(int(np.argmax(gaps)))}{more}; expected no slice to be missing, and no gap over "
+            f"{most:g} times the usual; "
             "copy the whole series"
         )
     if gaps.min() < least * usual:
         raise PatientError(
-            f"{name}: {pair(int(np.argmin(gaps)))}; expected one stack, no gap under {least:g} times the usual; "
+            f"{name}: {pair(int(np.argmin(gaps)))}; expected one stack, no gap under {least:g} times the "
+            "usual; "
             "two acquisitions may overlap here: remove one"
         )
     if usual > MOST_GAP_MM + SAME_PLACE_MM:
         raise PatientError(
-            f"{name}: slices are {usual:.1f} mm apart; expected at most {MOST_GAP_MM:g} mm; choose a thinner series"
+            f"{name}: slices are {usual:.1f} mm apart; expected at most {MOST_GAP_MM:g} mm; choose a thinner "
+            "series"
         )
     extent = along[-1] - along[0]
     gap = extent / len(gaps)
@@ -199,16 +224,18 @@ def _even(
         return np.arange(len(along), dtype=float), float(gap)
     planes, gap = _finest_planes(along - along[0])
     notes.append(
-        f"slices are {gaps.min():.2f} to {gaps.max():.2f} mm apart: resampled to {gap:.2f} mm, linearly between neighbours"
+        f"slices are {gaps.min():.2f} to {gaps.max():.2f} mm apart: resampled to {gap:.2f} mm, linearly "
+        "between neighbours"
     )
     return planes, gap
 
 
 def _finest_planes(along: np.ndarray) -> tuple[np.ndarray, float]:
-    """Positions [mm] of unevenly spaced slices, the first at 0, on an even grid [planes], and its spacing [mm].
+    """Positions [mm] of unevenly spaced slices, the first at 0, on an even grid [planes], and its spacing
+    [mm].
 
-    The spacing is at most the least gap: the largest with a plane at each slice, such as 1 mm for gaps of 5 and 7 mm. Where there is
-    none above FINEST_MM, it is the one with planes nearest to the slices.
+    The spacing is at most the least gap: the largest with a plane at each slice, such as 1 mm for gaps of 5
+    and 7 mm. Where there is none above FINEST_MM, it is the one with planes nearest to the slices.
     """
     closest = float(np.diff(along).min())
     worst = []
@@ -223,7 +250,9 @@ def _finest_planes(along: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _parts_of_one_spacing(gaps: np.ndarray) -> list[slice]:
-    """The parts (of ``gaps``) of a series whose spacing changes from one to another; [] where single slices are missing or too many."""
+    """The parts (of ``gaps``) of a series whose spacing changes from one to another; [] where single
+    slices are missing or too many.
+    """
     change = 1 + np.flatnonzero(np.maximum(gaps[1:], gaps[:-1]) > SAME_GAP * np.minimum(gaps[1:], gaps[:-1]))
     runs = [slice(a, b) for a, b in pairwise([0, *change.tolist(), len(gaps)])]
     parts = [run for run in runs if run.stop - run.start >= PART_FROM_GAPS]
@@ -239,7 +268,9 @@ def _parts_of_one_spacing(gaps: np.ndarray) -> list[slice]:
 def _straightened(
     name: str, slices: list[DicomSlice], normal: np.ndarray, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """Origin of a rectangular grid that covers all slices, their in-plane shifts [pixels], and its columns and rows."""
+    """Origin of a rectangular grid that covers all slices, their in-plane shifts [pixels], and its columns
+    and rows.
+    """
     first = slices[0]
     axes = np.column_stack([first.row, first.column])
     positions = np.array([s.position for s in slices])
@@ -255,18 +286,21 @@ def _straightened(
     worst = int(np.argmax(off))
     if off[worst] > OUT_OF_LINE * spacing.min():
         raise PatientError(
-            f"{name}: {slices[worst].label} is {off[worst]:.1f} mm to the side of its neighbours; expected slices in one "
+            f"{name}: {slices[worst].label} is {off[worst]:.1f} mm to the side of its neighbours; expected "
+            "slices in one "
             "line; remove the wrong slice, or export the series again"
         )
     angle = float(np.degrees(np.arctan(np.linalg.norm(shear))))
     if angle > MOST_TILT:
         raise PatientError(
-            f"{name}: its slices are tilted by {angle:.1f} degrees; expected at most {MOST_TILT:g}; export the series again"
+            f"{name}: its slices are tilted by {angle:.1f} degrees; expected at most {MOST_TILT:g}; export "
+            "the series again"
         )
     low, high = offsets.min(axis=0), offsets.max(axis=0)
     extra = np.ceil((high - low) / spacing - 1e-6).astype(int)
     notes.append(
-        f"the gantry was tilted by {angle:.1f} degrees: slices shifted within their planes by up to {np.abs(offsets).max():.1f} mm"
+        f"the gantry was tilted by {angle:.1f} degrees: slices shifted within their planes by up to "
+        f"{np.abs(offsets).max():.1f} mm"
     )
     return (
         first.position + axes @ low,

@@ -12,8 +12,8 @@ LEAST = 3
 
 
 def joined(candidates: list[Series]) -> list[Series]:
-    """The series, where several of one slice each are one: of one study, frame of reference, orientation, size and spacing, at even
-    distances.
+    """The series, where several of one slice each are one: of one study, frame of reference, orientation,
+    size and spacing, at even distances.
     """
     groups: dict[tuple, list[Series]] = defaultdict(list)
     for series in candidates:
@@ -53,7 +53,8 @@ def _one_series(group: list[Series]) -> Series:
         slices=[series.slices[0] for series in group],
         other_uids=frozenset(series.uid for series in group[1:]),
         notes=[
-            f"each of {len(group)} slices has a SeriesInstanceUID of its own: they were read as one series, as they share study, frame of "
+            f"each of {len(group)} slices has a SeriesInstanceUID of its own: they were read as one series, "
+            "as they share study, frame of "
             "reference, orientation, size and spacing, at even distances"
         ],
     )

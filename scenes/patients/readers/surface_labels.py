@@ -1,4 +1,6 @@
-"""Read closed surfaces (STL, PLY, OBJ) as labels: one structure a file, voxels where the surface is wound around their centre."""
+"""Read closed surfaces (STL, PLY, OBJ) as labels: one structure a file, voxels where the surface is wound
+around their centre.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,8 +20,8 @@ from scenes.volumes.voxel_grid import VoxelGrid
 VOXELS, VOXEL_MM = 75, (0.5, 1.5)
 # Voxels of a box: those of a structure that is long and thin, such as vessels, become wider for that.
 MOST_VOXELS = 30e6
-# The first voxel before the surface, in voxels. On voxels that lie evenly about a ball, the errors of eight octants would be one, not
-# eight: 0.6 % of its volume instead of 0.07 % (radius 5 to 10 mm).
+# The first voxel before the surface, in voxels. On voxels that lie evenly about a ball, the errors of eight
+# octants would be one, not eight: 0.6 % of its volume instead of 0.07 % (radius 5 to 10 mm).
 FIRST_VOXEL = np.array([0.13, 0.29, 0.41])
 # Voxels along a block: one far from the surface is inside or outside as a whole.
 BLOCK = 4
@@ -34,7 +36,8 @@ NAMED_OPENINGS = 3
 def read_surfaces(
     files: Sequence[Path], near_mm: float, progress: Progress, space: Space | None = None
 ) -> Segmentation:
-    """One structure a file, named by the file. Of other structures than kidneys only the part near these is labelled.
+    """One structure a file, named by the file. Of other structures than kidneys only the part near these is
+    labelled.
 
     Args:
         files: one or more.
@@ -43,7 +46,8 @@ def read_surfaces(
         space: of files that state none.
 
     Raises:
-        PatientError: no closed surface in mm; later, on the CT's grid: outside the CT, or bodies that cover each other.
+        PatientError: no closed surface in mm; later, on the CT's grid: outside the CT, or bodies that cover
+        each other.
     """
     stated = {file: stated_space(file) for file in files}
     spaces = {file: own or space for file, own in stated.items()}
@@ -84,7 +88,8 @@ def _closed(file: Path) -> trimesh.Trimesh:
             else "micrometres"
         )
         raise PatientError(
-            f"{file}: is {extent:.3g} mm long; expected mm, and these seem to be {unit}; scale the surface, or export it in mm"
+            f"{file}: is {extent:.3g} mm long; expected mm, and these seem to be {unit}; scale the surface, "
+            "or export it in mm"
         )
     edges = surface.edges  # directed, three a triangle
     if openings := _openings(surface.vertices, edges):
@@ -93,14 +98,17 @@ def _closed(file: Path) -> trimesh.Trimesh:
             for middle, width in openings[:NAMED_OPENINGS]
         )
         raise PatientError(
-            f"{file}: is not closed, or its triangles face both ways, at {len(openings)} places, in the file's coordinates around "
+            f"{file}: is not closed, or its triangles face both ways, at {len(openings)} places, in the "
+            "file's coordinates around "
             f"{places}; expected a closed surface; repair it, for example in 3D Slicer or MeshLab"
         )
     return surface
 
 
 def _openings(vertices: np.ndarray, edges: np.ndarray) -> list[tuple[np.ndarray, float]]:
-    """Middle (3,) and width of each place where directed edges (n, 2) have no opposite: the surface is open, or turns over."""
+    """Middle (3,) and width of each place where directed edges (n, 2) have no opposite: the surface is
+    open, or turns over.
+    """
     pairs, place = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
     ways = np.bincount(place.ravel(), np.where(edges[:, 0] < edges[:, 1], 1, -1), len(pairs))
     alone = pairs[(ways != 0) & (pairs[:, 0] != pairs[:, 1])]
@@ -118,7 +126,8 @@ def _check_place(file: Path, surface: trimesh.Trimesh, space: Space | None, ct: 
     if here < LEAST_IN_CT < there:
         stated = "as it states" if space else "as was assumed"
         raise PatientError(
-            f"{file}: has {here:.0%} of its surface in the CT as {space or 'LPS'}, {stated}, and {there:.0%} as {other}; export it again "
+            f"{file}: has {here:.0%} of its surface in the CT as {space or 'LPS'}, {stated}, and {there:.0%} "
+            f"as {other}; export it again "
             f"with the right coordinate system, or write SPACE={other} into its header"
         )
 
@@ -136,7 +145,8 @@ def _grid_of(surface: trimesh.Trimesh, low: np.ndarray, high: np.ndarray) -> Vox
 
 
 def _voxels(file: Path, surface: trimesh.Trimesh, grid: VoxelGrid) -> np.ndarray:
-    """Mask (z, y, x) of the voxels that a surface is wound around, whichever way it faces; a hollow faces the other way.
+    """Mask (z, y, x) of the voxels that a surface is wound around, whichever way it faces; a hollow faces the
+    other way.
 
     Raises PatientError where much of it is inside two bodies of the surface.
     """
@@ -168,7 +178,8 @@ def _voxels(file: Path, surface: trimesh.Trimesh, grid: VoxelGrid) -> np.ndarray
     double = float((np.abs(wound[inside]) > 1).mean())
     if double > MOST_DOUBLE:
         raise PatientError(
-            f"{file}: {double:.0%} of it is inside two bodies that face the same way; expected one structure, a hollow in it facing inward; "
+            f"{file}: {double:.0%} of it is inside two bodies that face the same way; expected one "
+            "structure, a hollow in it facing inward; "
             "export each structure as its own file, or unite its bodies"
         )
     return inside.transpose(2, 1, 0)

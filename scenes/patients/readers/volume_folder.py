@@ -26,12 +26,16 @@ def volume_files(path: Path) -> list[Path]:
 
 
 def only_volume(folder: Path, files: list[Path], space: Space | None = None) -> LazyVolume:
-    """The one volume file of a folder that is not named as labels. Raises PatientError where there are several, or labels alone."""
+    """The one volume file of a folder that is not named as labels.
+
+    Raises PatientError where there are several, or labels alone.
+    """
     images = [file for file in files if not _is_named_as_labels(file)] if len(files) > 1 else files
     if len(images) != 1:
         names = listed([str(file.relative_to(folder)) for file in images or files])
         raise PatientError(
-            f"{folder}: has {len(images) or len(files)} files that may be the CT{'' if images else ', all named as labels'}: {names}; "
+            f"{folder}: has {len(images) or len(files)} files that may be the "
+            f"CT{'' if images else ', all named as labels'}: {names}; "
             "expected one; give its path as CT"
         )
     volume = file_volume(images[0], space=space)
