@@ -12,7 +12,7 @@ from rehearsal.drawn_geometry import drawn_geometry, open_viewer
 from rehearsal.image_and_surface_files import save_image_file, save_surfaces
 from rehearsal.imaging import image_view
 from rehearsal.loop.command import SetValues
-from rehearsal.loop.observer import Observer, Source
+from rehearsal.loop.protocols import Observer, Source
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally, summary
 from rehearsal.notices import Notices
@@ -105,7 +105,7 @@ class HeadlessLoop:
             for command in self.source.commands(self.rehearsal.frame, controls, step_s):
                 if isinstance(command, SetValues):
                     set_settings(self.settings, command.values)
-                self.rehearsal.stepper.submit(command)
+                self.rehearsal.timeline.submit(command)
             frame = self.rehearsal.do()
             probe = probe_with_settings(anatomy.case.probe, self.settings)
             view = self._view(probe) if draws else None

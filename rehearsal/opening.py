@@ -148,7 +148,7 @@ def built_headless(
     needs_b_mode = case.scene.image.mode != "ct" and not asked.no_pictures
     rehearsal = Rehearsal(case, anatomy, progress, needs_b_mode, serial)
     model = rehearsal.organ.model
-    shown = rehearsal.anatomy, rehearsal.stepper, rehearsal.manipulator
+    shown = rehearsal.anatomy, rehearsal.timeline, rehearsal.manipulator
     return Built(*shown, model.counts(), model.serial, rehearsal)
 
 

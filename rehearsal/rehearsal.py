@@ -16,7 +16,7 @@ from rehearsal.configuration import with_quality
 from rehearsal.deformed_anatomy import DeformedAnatomy, scanned_ct
 from rehearsal.loop.command import Command, Load, Move, NewSession
 from rehearsal.loop.frame import Frame
-from rehearsal.loop.stepper import LocalStepper, Stepper
+from rehearsal.loop.protocols import Stepper
 from rehearsal.loop.timeline import Timeline
 from rehearsal.pressed_organ import PressedOrgan
 from scenes.anatomy import LoadedAnatomy, load_anatomy
@@ -53,9 +53,9 @@ class Rehearsal:
         self.anatomy = DeformedAnatomy(case, loaded, self.organ.model.carrier.interpolation, scanned)
         progress("Building the model: the tissue comes to rest")
         self.organ.settle()
-        self.stepper = LocalStepper(Timeline(self.organ))
-        self.manipulator = begin(case, self.anatomy, self.stepper)
-        self._settled = self.stepper.timeline.whole_state()
+        self.timeline = Timeline(self.organ)
+        self.manipulator = begin(case, self.anatomy, self.timeline)
+        self._settled = self.timeline.whole_state()
 
     @property
     def frame(self) -> Frame:
@@ -65,8 +65,8 @@ class Rehearsal:
     def do(self, *commands: Command) -> Frame:
         """Apply commands, and show the frame after them."""
         for command in commands:
-            self.stepper.submit(command)
-        frame = self.stepper.newest()
+            self.timeline.submit(command)
+        frame = self.timeline.newest()
         self.anatomy.show(frame)
         return frame
 

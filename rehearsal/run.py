@@ -18,8 +18,7 @@ from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.headless import HeadlessLoop, run_headless
 from rehearsal.loop.command import Checkpoint
 from rehearsal.loop.frame import Checkpointed, Frame
-from rehearsal.loop.observer import Observer, Source
-from rehearsal.loop.stepper import Stepper
+from rehearsal.loop.protocols import Observer, Source, Stepper
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally
 from rehearsal.measurements.session_summary import summary_text

@@ -16,8 +16,7 @@ from rehearsal.drawn_geometry import drawn_geometry
 from rehearsal.imaging import image_view
 from rehearsal.loop.command import SetValues
 from rehearsal.loop.frame import Frame
-from rehearsal.loop.observer import Observer, Source
-from rehearsal.loop.stepper import Stepper
+from rehearsal.loop.protocols import Observer, Source, Stepper
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.settings import probe_with_settings, set_settings

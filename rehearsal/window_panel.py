@@ -17,7 +17,7 @@ from rehearsal.cine import Cine, CineFrame
 from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.image_and_surface_files import save_screenshot, save_surfaces, save_view
 from rehearsal.imaging import image_view, readouts
-from rehearsal.loop.observer import Source
+from rehearsal.loop.protocols import Source
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.notices import Notices
 from rehearsal.planning.plans_in_window import PlanControl

@@ -17,7 +17,6 @@ from rehearsal.loop.command import (
     SetValues,
     Undo,
 )
-from rehearsal.loop.stepper import LocalStepper
 from rehearsal.notices import Notices
 from rehearsal.sessions.packed_arrays import SeenVoxels
 from rehearsal.sessions.recorder import SessionRecorder
@@ -38,7 +37,7 @@ class LiveSession:
         seen: Callable[[], SeenVoxels | None] = lambda: None,
         header: Header | None = None,
     ) -> None:
-        self.stepper, self.notices = LocalStepper(fake_timeline()), Notices()
+        self.stepper, self.notices = fake_timeline(), Notices()
         self.stepper.submit(NewSession(pose=np.eye(4)))
         self.recorder = SessionRecorder(path, header or globals()["header"](), self.notices, seen)
 
@@ -52,7 +51,7 @@ class LiveSession:
         """Make so many steps; the digest after them."""
         for number in range(count):
             self.do(Move(pose=pose_at(number % 7 - 3.0)))
-        return self.stepper.timeline.organ.digest()
+        return self.stepper.organ.digest()
 
     def on_disk(self) -> None:
         """Wait until the disk has all that was handed to it."""

@@ -9,7 +9,6 @@ from fake_organ import fake_timeline
 
 from rehearsal.loop.command import Command, NewSession, SetValues
 from rehearsal.loop.frame import Frame
-from rehearsal.loop.stepper import LocalStepper
 from rehearsal.notices import Notices
 from rehearsal.sources.tracker import Tracker
 from rehearsal.sources.user import UserSource
@@ -54,7 +53,7 @@ class UserAtBall:
     """Applies the commands of a ``UserSource`` in this process, as a headless run does."""
 
     def __init__(self, tracked: Any = None, **given: Any) -> None:
-        self.stepper, self.notices = LocalStepper(fake_timeline()), Notices()
+        self.stepper, self.notices = fake_timeline(), Notices()
         self.manipulator = ball_manipulator()
         self.stepper.submit(NewSession(pose=self.manipulator.pose()))
         self.case = BallCase()
@@ -78,7 +77,7 @@ class UserAtBall:
 
     @property
     def timeline(self):
-        return self.stepper.timeline
+        return self.stepper
 
     @property
     def kinds(self) -> list[str]:

@@ -81,8 +81,8 @@ class Timeline:
         self._events: list[Event] = []
         self._noted_iterations = organ.settings.iterations
 
-    def apply(self, command: Command) -> None:
-        """Apply a command. ``Follow`` is a step of the length that is set."""
+    def submit(self, command: Command) -> None:
+        """Apply a command at once. ``Follow`` is a step of the length that is set."""
         match command:
             case Move():
                 self.step(command.pose, command.length_s)
@@ -128,7 +128,7 @@ class Timeline:
         self._end_state(length_s)
         return step
 
-    def frame(self, pace: str = "") -> Frame:
+    def newest(self, wait_s: float = 0.0) -> Frame:
         """The present state, with the events since the last call."""
         events, self._events = tuple(self._events), []
         organ, carrier = self.organ, self.organ.model.carrier
@@ -144,9 +144,11 @@ class Timeline:
             manipulator=self._manipulator,
             kept=frozenset(self._kept),
             bookmarks=self.history.bookmarks,
-            pace=pace,
             events=events,
         )
+
+    def wait(self, most_s: float = np.inf) -> None:
+        """Nothing to wait for: commands are applied at once."""
 
     def whole_state(self) -> WholeState:
         """A copy of the present state."""

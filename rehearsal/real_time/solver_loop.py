@@ -4,7 +4,7 @@ steps that the clock asks for.
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from time import perf_counter
 from typing import Any
@@ -81,7 +81,7 @@ def compute(connection: Connection, parent: int) -> None:
     organ.advance(organ.pose)
     organ.restore(at_rest)
     timeline = Timeline(organ)
-    memory = _shared(connection, timeline.frame())
+    memory = _shared(connection, timeline.newest())
     if memory is not None:
         SolverLoop(connection, timeline, setup.pace, memory).serve()
 
@@ -133,8 +133,8 @@ class SolverLoop:
             return
         if isinstance(command, Pause | Move | NewSession):
             self._runs = False
-        self._timeline.apply(command)
-        frame = self._timeline.frame()
+        self._timeline.submit(command)
+        frame = self._timeline.newest()
         if self._runs and frame.restored:
             # The hand has not moved since.
             self._path.stay(frame.pose, perf_counter())
@@ -171,7 +171,7 @@ class SolverLoop:
         pose = self._path.pose_after(length_s)
         clock = self._path.input_s, 1000 * late_s, pace.waits_for_input
         step = self._timeline.step(pose, length_s, pace.iterations(full), *clock)
-        self._send(self._timeline.frame(text))
+        self._send(replace(self._timeline.newest(), pace=text))
         pace.watch(step.took_ms, length_s)
 
     def _plan_steps(self) -> None:

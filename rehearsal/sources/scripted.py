@@ -7,7 +7,7 @@ import numpy as np
 
 from rehearsal.loop.command import Command, Move, NewSession, SetValues
 from rehearsal.loop.frame import Frame
-from rehearsal.loop.observer import Source
+from rehearsal.loop.protocols import Source
 from rehearsal.notices import Notices
 from rehearsal.sessions.replay import Replay
 from render.viewer import Controls

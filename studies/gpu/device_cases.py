@@ -158,7 +158,6 @@ def _bent() -> "DeformedAnatomy":
     """
     from rehearsal.case import case_of
     from rehearsal.deformed_anatomy import DeformedAnatomy, scanned_ct
-    from rehearsal.loop.stepper import LocalStepper
     from rehearsal.loop.timeline import Timeline
     from rehearsal.pressed_organ import PressedOrgan
     from rehearsal.rehearsal import begin
@@ -172,7 +171,7 @@ def _bent() -> "DeformedAnatomy":
     waves = np.sin(2 * np.pi / WAVE_MM * body.position[:, [1, 2, 0]])
     bent = replace(body, position=body.position + np.float32(BEND_MM) * waves.astype(np.float32))
     organ.restore(replace(state, solver=replace(state.solver, body=bent)))
-    begin(case, anatomy, LocalStepper(Timeline(organ)))
+    begin(case, anatomy, Timeline(organ))
     return anatomy
 
 

@@ -80,7 +80,7 @@ def recorded(
     rehearsal: Rehearsal, anatomy: LoadedAnatomy, arch: str, out: Path, steps: int, bar: tqdm
 ) -> tuple[Path, str]:
     """Record a restless user for so many steps; the session's file, and a hash of the tissue at its end."""
-    case, timeline = rehearsal.case, rehearsal.stepper.timeline
+    case, timeline = rehearsal.case, rehearsal.timeline
     step_s, notices = case.scene.solver.time_step_s, Notices()
     header = header_of(case, anatomy, arch, rehearsal.organ.model.serial, step_s, begins=None)
     recorder = SessionRecorder(next_path(out), header, notices)
@@ -97,7 +97,7 @@ def recorded(
                     command.pose, pace.length_s, pace.iterations(rehearsal.organ.settings.iterations)
                 )
             else:
-                timeline.apply(command)
+                timeline.submit(command)
         recorder.observe(rehearsal.do())
         bar.update()
     recorder.observe(rehearsal.do(Checkpoint()))

@@ -173,12 +173,12 @@ class FollowedPlan:
 
     def __init__(self) -> None:
         self.timeline = fake_timeline()
-        self.timeline.apply(NewSession(pose=advanced(FIRST[0], -50.0)))
+        self.timeline.submit(NewSession(pose=advanced(FIRST[0], -50.0)))
         self.guide = guide_of(sweep_of(FIRST, SECOND), sweep_of(SECOND))
 
     def do(self, command: Command) -> dict[str, float | None]:
         """The figures after a command."""
-        self.timeline.apply(command)
+        self.timeline.submit(command)
         self.guide.observe(self.timeline.frame())
         return self.guide.figures()
 

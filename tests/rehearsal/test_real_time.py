@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import rotation_about
+from fake_organ import fake_timeline
 
 from rehearsal.case import case_of
 from rehearsal.loop.command import Bookmark, Follow, GoTo, Move, NewSession, Pause, SetValues
@@ -100,7 +101,7 @@ def test_each_frame_is_of_one_instant_and_has_the_bits_of_the_same_steps_here(so
     home, compared = reference.manipulator.pose(), 0
     for frame in pressing(solver, home, 300):
         for step in frame.steps:
-            reference.stepper.timeline.step(step.pose, step.length_s, step.iterations)
+            reference.timeline.step(step.pose, step.length_s, step.iterations)
         here = reference.do()
         assert here.positions.tobytes() == frame.positions.tobytes()
         assert np.array_equal(here.pose, frame.pose)
@@ -255,7 +256,9 @@ class ClockedLoop(SolverLoop):
         return Step(0, pose, length_s, iterations, 10.0)
 
     def aim(self, command: Follow) -> None: ...
-    def frame(self, pace: str) -> None: ...
+    def newest(self) -> Frame:
+        return fake_timeline().newest()
+
     def _send(self, frame: None) -> None: ...
 
 

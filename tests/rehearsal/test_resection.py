@@ -265,8 +265,8 @@ def test_the_papers_model_cannot_be_cut_and_says_so(patient, rehearsal, marks):
     scene, loaded = rehearsal.case.scene, patient[1]
     particles = with_options(scene, {"tissue.model": "shape-matching", "tissue.radius_mm": 8.0})
     timeline = Timeline(PressedOrgan(case_of(particles, loaded)))
-    timeline.apply(Mark(places_mm=marks.tolist()))
-    timeline.apply(cut_command(rehearsal.anatomy, CUT, None))
+    timeline.submit(Mark(places_mm=marks.tolist()))
+    timeline.submit(cut_command(rehearsal.anatomy, CUT, None))
     (notice,) = timeline.frame().notices
     assert "cannot be cut; choose --model neo-hookean" in notice and timeline.geometry.cut is None
 
@@ -337,7 +337,7 @@ def test_undo_of_a_cut_restores_friction_under_a_pressing_probe(rehearsal, marks
 
 
 def test_cuts_that_are_undone_leave_no_fields_and_a_cut_survives_as_text(rehearsal, marks):
-    timeline, anatomy = rehearsal.stepper.timeline, rehearsal.anatomy
+    timeline, anatomy = rehearsal.timeline, rehearsal.anatomy
     scored(rehearsal, marks)
     uncut = timeline.whole_state()
     assert cut(rehearsal) == []

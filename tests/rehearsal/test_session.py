@@ -21,7 +21,6 @@ from recorded_session import LiveSession, header, record_all
 import app
 from rehearsal.configuration import probe_of
 from rehearsal.loop.command import CutOut, GoTo, Move, Undo
-from rehearsal.loop.stepper import LocalStepper
 from rehearsal.notices import Notices
 from rehearsal.sessions.packed_arrays import (
     StateError,
@@ -213,7 +212,7 @@ def voxels(count: int) -> np.ndarray:
 
 
 def test_beside_each_whole_state_is_what_was_seen_until_then(tmp_path):
-    live = LiveSession(tmp_path / "session", lambda: pack_seen(voxels(live.stepper.timeline.number)))
+    live = LiveSession(tmp_path / "session", lambda: pack_seen(voxels(live.stepper.number)))
     live.recorder.close({})
     record_all(tmp_path / "session-2", seen=lambda: pack_seen(voxels(60)))
     log = read_log(tmp_path / "session-2")
@@ -268,7 +267,7 @@ def changed_state(name: str, change: Any) -> str:
     ],
 )
 def test_a_state_that_no_tissue_has_is_refused(tmp_path, name, change):
-    positions = fake_timeline().frame().positions
+    positions = fake_timeline().newest().positions
     with np.errstate(invalid="ignore"), pytest.raises(StateError):
         unpack_state(changed_state(name, change), positions)
     assert unpack_state(pack_state(fake_timeline().whole_state()), positions) is not None
@@ -285,7 +284,7 @@ def test_a_state_that_no_tissue_has_is_refused(tmp_path, name, change):
 def replayed(log: Any, notices: Notices) -> ReplayCheck:
     """A replay to its end. Raises SessionError."""
     stepper, replay, check = (
-        LocalStepper(fake_timeline()),
+        fake_timeline(),
         Replay(log, one_by_one=True),
         ReplayCheck(log, notices),
     )
@@ -322,7 +321,7 @@ def test_a_command_that_cannot_be_repeated_ends_the_replay_in_words(tmp_path):
 
 def test_a_replay_keeps_pace_with_the_clock_and_does_not_run_away_from_a_slow_solver(tmp_path):
     record_all(tmp_path / "session")
-    replay, stepper = Replay(read_log(tmp_path / "session")), LocalStepper(fake_timeline())
+    replay, stepper = Replay(read_log(tmp_path / "session")), fake_timeline()
 
     def given(elapsed_s: float) -> int:
         commands = replay.commands(stepper.newest(), Controls(Settings()), elapsed_s)

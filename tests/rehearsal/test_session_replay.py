@@ -104,7 +104,7 @@ def run_of(
 ):
     """A run whose steps are made in this process."""
     model = rehearsal.organ.model
-    shown = rehearsal.anatomy, rehearsal.stepper, rehearsal.manipulator
+    shown = rehearsal.anatomy, rehearsal.timeline, rehearsal.manipulator
     built = run.Built(*shown, model.counts(), model.serial, rehearsal)
     return run.RehearsalRun(built, loaded, "cpu", asked, files, viewer)
 
@@ -175,7 +175,7 @@ def opened_at(built, log: Log, at_s: float) -> tuple[LiveMeasurements, Replay]:
     rehearsal = rewound(built[0])
     settings, replay = initial_settings(rehearsal.case), Replay(log)
     instruments = LiveMeasurements(rehearsal.anatomy, rehearsal.manipulator)
-    given = rehearsal.stepper, rehearsal.anatomy, settings, instruments, [instruments]
+    given = rehearsal.timeline, rehearsal.anatomy, settings, instruments, [instruments]
     open_session(replay, at_s, *given)
     return instruments, replay
 

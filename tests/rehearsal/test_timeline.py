@@ -28,7 +28,6 @@ from rehearsal.loop.command import (
 )
 from rehearsal.loop.frame import Applied, Digest, Refused, Step
 from rehearsal.loop.history import MOST_UNDONE, History
-from rehearsal.loop.stepper import LocalStepper
 from rehearsal.loop.timeline import SETTLED, Timeline
 from rehearsal.notices import Notices
 from rehearsal.sessions.recorder import SessionRecorder
@@ -62,7 +61,7 @@ def repeated(path: Path, at_s: float = 0.0) -> tuple[Timeline, ReplayCheck]:
     """
     log = read_log(path)
     replay, check = Replay(log, one_by_one=True), ReplayCheck(log, Notices())
-    stepper = LocalStepper(fake_timeline())
+    stepper = fake_timeline()
     stepper.submit(NewSession(pose=np.eye(4)))
     for command in replay.begin(stepper.newest().positions, at_s):
         stepper.submit(command)
@@ -74,7 +73,7 @@ def repeated(path: Path, at_s: float = 0.0) -> tuple[Timeline, ReplayCheck]:
     frame = stepper.newest()
     replay.check(frame)
     check.observe(frame, None)
-    return stepper.timeline, check
+    return stepper, check
 
 
 class AnySession(RuleBasedStateMachine):
@@ -84,9 +83,9 @@ class AnySession(RuleBasedStateMachine):
         super().__init__()
         self._folder = tempfile.TemporaryDirectory()
         self.path = Path(self._folder.name) / "session"
-        self.stepper = LocalStepper(fake_timeline())
+        self.stepper = fake_timeline()
         self.stepper.submit(NewSession(pose=np.eye(4)))
-        self.timeline = self.stepper.timeline
+        self.timeline = self.stepper
         self.recorder = SessionRecorder(self.path, header(), Notices())
         self.settled = state_of(self.timeline)
         self.before: list[tuple] = []
@@ -213,7 +212,7 @@ def test_what_is_refused_changes_nothing_and_says_why():
         (Redo(), "Nothing to redo"),
         (GoTo(state=3), "no such"),
     ):
-        timeline.apply(command)
+        timeline.submit(command)
         (event,) = timeline.frame().events
         assert isinstance(event, Refused) and why in event.reason and event.command == command
     assert state_of(timeline) == before and timeline.number == 0
@@ -229,10 +228,10 @@ def test_iterations_are_recorded_as_they_were_and_not_as_they_are_set():
 
 def test_each_second_has_a_digest_and_each_way_back():
     timeline = fake_timeline()
-    timeline.apply(BeginAction())
+    timeline.submit(BeginAction())
     for _ in range(20):
-        timeline.apply(Move(pose=pose_at(1.0)))
-    timeline.apply(Undo())
+        timeline.submit(Move(pose=pose_at(1.0)))
+    timeline.submit(Undo())
     frame = timeline.frame()
     assert [event.number for event in frame.events if isinstance(event, Digest)] == [8, 16, 21]
     assert [step.number for step in frame.steps] == [*range(20)] and frame.restored == [0]
@@ -243,5 +242,5 @@ def test_a_state_of_another_body_is_refused():
     timeline = fake_timeline()
     other = timeline.whole_state()
     other.organ.solver.history["plane"] = np.zeros((3, 4), np.float32)
-    timeline.apply(Load(state=other, number=7))
+    timeline.submit(Load(state=other, number=7))
     assert timeline.frame().notices == ["a state of another body, or a damaged one"] and timeline.number == 0

@@ -24,7 +24,6 @@ from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.imaging import captions, readouts, scale_texts
 from rehearsal.loop.command import BeginAction, Bookmark, Move, NewSession, SetValues, Undo
 from rehearsal.loop.frame import Frame, Step
-from rehearsal.loop.stepper import LocalStepper
 from rehearsal.notices import Notices
 from rehearsal.window_loop import PREPARING, WindowLoop
 from rehearsal.window_panel import WindowPanel
@@ -121,7 +120,7 @@ class Looping:
     def __init__(self, out: Path, link: Any = None, warnings: tuple[str, ...] = ()) -> None:
         self.notices, self.viewer = Notices(), NullViewer(script=iter(lambda: self.controls, None))
         self.controls = Controls(self.viewer.settings)
-        self.stepper = LocalStepper(fake_timeline())
+        self.stepper = fake_timeline()
         self.stepper.submit(NewSession(pose=np.eye(4)))
         self.anatomy, self.measurements, self.source = FakeAnatomy(), FakeMeasurements(), OneMove()
         self.anatomy.show(self.stepper.newest())
@@ -227,7 +226,7 @@ def test_a_geometry_of_another_version_is_drawn_anew_and_earlier_images_are_forg
     changed: list[Any] = []
     looping.viewer.change_geometry = changed.append
     monkeypatch.setattr(window_loop, "drawn_geometry", lambda anatomy: anatomy.geometry.version)
-    timeline = looping.stepper.timeline
+    timeline = looping.stepper
     looping.next()
     whole, cine = timeline.geometry, looping.panel.cine
     timeline.geometry = replace(whole, version=1)
@@ -279,9 +278,9 @@ def test_what_is_done_is_said_with_the_frame_in_which_it_was(looping):
 
 
 def test_a_restored_state_is_a_notice_and_stands_in_the_panel_for_a_while(looping, capsys):
-    looping.stepper.timeline.organ.notice = "The tissue was restored"
+    looping.stepper.organ.notice = "The tissue was restored"
     looping.next()
-    looping.stepper.timeline.organ.notice = ""
+    looping.stepper.organ.notice = ""
     assert looping.next().status.startswith("STATE RESTORED")
     assert capsys.readouterr().out.count("The tissue was restored") == 1
     looping.panel.announcements._restored_until = 0.0
@@ -291,7 +290,7 @@ def test_a_restored_state_is_a_notice_and_stands_in_the_panel_for_a_while(loopin
 def test_a_pace_that_differs_is_said_once(tmp_path, capsys):
     announcements = Announcements(None, Notices())
     step = Step(0, np.eye(4), STEP_S, 4, 1.0)
-    frame = replace(fake_timeline().frame(), events=(step,))
+    frame = replace(fake_timeline().newest(), events=(step,))
     for pace in ("", "LONGER STEPS   1/30 s", "LONGER STEPS   1/15 s", ""):
         announcements.observe(replace(frame, pace=pace), None)
     assert announcements.notices.present() == []
@@ -351,7 +350,7 @@ def test_a_frozen_image_keeps_its_caliper_and_a_live_one_until_the_probe_moves(l
     place = (1.0, 2.0)
     assert looping.next(pointed_mm=place).caliper_mm == (place,)
     assert looping.next(pointed_mm=place).caliper == "0.0 mm"
-    looping.stepper.timeline.organ.pose = np.eye(4) + np.eye(4, k=3)
+    looping.stepper.organ.pose = np.eye(4) + np.eye(4, k=3)
     assert looping.next(freeze=True).caliper == "0.0 mm"
     assert looping.next(freeze=True).caliper_mm == ()
 
@@ -451,7 +450,7 @@ def test_pictures_of_an_earlier_run_are_not_replaced_without_a_word(monkeypatch,
     if earlier:
         picture.touch()
     anatomy = FakeAnatomy()
-    anatomy.show(fake_timeline().frame())
+    anatomy.show(fake_timeline().newest())
     headless.Pictures(anatomy, 3, tmp_path)
     said = f"Replacing the pictures of an earlier run in {tmp_path}.\n" if earlier else ""
     assert capsys.readouterr().out == said and not picture.exists()
@@ -461,7 +460,7 @@ class FakeRehearsal:
     """A fake organ with its stepper and its anatomy."""
 
     def __init__(self) -> None:
-        self.stepper, self.anatomy = LocalStepper(fake_timeline()), FakeAnatomy()
+        self.stepper, self.anatomy = fake_timeline(), FakeAnatomy()
         self.do()
 
     @property
@@ -515,7 +514,7 @@ def test_without_a_window_images_go_to_the_link_and_the_tissue_into_the_folder(
 
 def fake_run(**asked: Any) -> run.RehearsalRun:
     anatomy = FakeAnatomy()
-    anatomy.show(fake_timeline().frame())
+    anatomy.show(fake_timeline().newest())
     built = run.Built(anatomy, None, ball_manipulator(), {"nodes": 7}, True)
     return run.RehearsalRun(built, None, "cpu", RehearseOptions(**asked), FILES)
 

@@ -1,7 +1,13 @@
-"""What looks at frames, and where their commands come from."""
+"""The three roles of the loop: a source gives commands, a stepper turns them into frames, observers look at
+frames.
+
+The stepper of this process is ``Timeline``, that of a process of its own is ``SolverProcess``.
+"""
 
 from collections.abc import Iterable
 from typing import Protocol
+
+import numpy as np
 
 from rehearsal.loop.command import Command
 from rehearsal.loop.frame import Frame
@@ -20,6 +26,23 @@ class Source(Protocol):
     def commands(self, frame: Frame, controls: Controls, elapsed_s: float) -> Iterable[Command]:
         """The commands after a frame, with the user's controls, a time [s] after the last ones."""
         ...
+
+
+class Stepper(Protocol):
+    """Applies commands in their order."""
+
+    def submit(self, command: Command) -> None:
+        """Have a command applied."""
+
+    def newest(self, wait_s: float = 0.0) -> Frame:
+        """The newest frame, with the events since the last call.
+
+        Where one that shows the newest input is due, wait for it so long.
+        """
+        ...
+
+    def wait(self, most_s: float = np.inf) -> None:
+        """Wait until all commands are applied, or for a time [s]."""
 
 
 class Observer(Protocol):
