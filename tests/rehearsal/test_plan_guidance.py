@@ -179,7 +179,7 @@ class FollowedPlan:
     def do(self, command: Command) -> dict[str, float | None]:
         """The figures after a command."""
         self.timeline.submit(command)
-        self.guide.observe(self.timeline.frame())
+        self.guide.observe(self.timeline.newest())
         return self.guide.figures()
 
     def act(self, *poses: np.ndarray) -> dict[str, float | None]:

@@ -267,7 +267,7 @@ def test_the_papers_model_cannot_be_cut_and_says_so(patient, rehearsal, marks):
     timeline = Timeline(PressedOrgan(case_of(particles, loaded)))
     timeline.submit(Mark(places_mm=marks.tolist()))
     timeline.submit(cut_command(rehearsal.anatomy, CUT, None))
-    (notice,) = timeline.frame().notices
+    (notice,) = timeline.newest().notices
     assert "cannot be cut; choose --model neo-hookean" in notice and timeline.geometry.cut is None
 
 

@@ -166,7 +166,7 @@ class AnySession(RuleBasedStateMachine):
 
     @invariant()
     def no_more_is_kept_than_may_be_restored(self) -> None:
-        kept = self.timeline.frame().kept if not self.timeline._events else frozenset()
+        kept = self.timeline.newest().kept if not self.timeline._events else frozenset()
         assert len(kept) <= 1 + len(self.before) + len(self.undone) + len(self.bookmarks)
 
     def teardown(self) -> None:
@@ -213,7 +213,7 @@ def test_what_is_refused_changes_nothing_and_says_why():
         (GoTo(state=3), "no such"),
     ):
         timeline.submit(command)
-        (event,) = timeline.frame().events
+        (event,) = timeline.newest().events
         assert isinstance(event, Refused) and why in event.reason and event.command == command
     assert state_of(timeline) == before and timeline.number == 0
 
@@ -222,7 +222,7 @@ def test_iterations_are_recorded_as_they_were_and_not_as_they_are_set():
     timeline = fake_timeline()
     for iterations in (None, 2, 2, None):
         timeline.step(pose_at(1.0), iterations=iterations)
-    values = [event.command.values for event in timeline.frame().events if isinstance(event, Applied)]
+    values = [event.command.values for event in timeline.newest().events if isinstance(event, Applied)]
     assert values == [{"iterations": 2}, {"iterations": 4}]
 
 
@@ -232,7 +232,7 @@ def test_each_second_has_a_digest_and_each_way_back():
     for _ in range(20):
         timeline.submit(Move(pose=pose_at(1.0)))
     timeline.submit(Undo())
-    frame = timeline.frame()
+    frame = timeline.newest()
     assert [event.number for event in frame.events if isinstance(event, Digest)] == [8, 16, 21]
     assert [step.number for step in frame.steps] == [*range(20)] and frame.restored == [0]
     assert isinstance(frame.events[1], Step) and frame.kept == {SETTLED, 20}
@@ -243,4 +243,4 @@ def test_a_state_of_another_body_is_refused():
     other = timeline.whole_state()
     other.organ.solver.history["plane"] = np.zeros((3, 4), np.float32)
     timeline.submit(Load(state=other, number=7))
-    assert timeline.frame().notices == ["a state of another body, or a damaged one"] and timeline.number == 0
+    assert timeline.newest().notices == ["a state of another body, or a damaged one"] and timeline.number == 0

@@ -460,7 +460,7 @@ class FakeRehearsal:
     """A fake organ with its stepper and its anatomy."""
 
     def __init__(self) -> None:
-        self.stepper, self.anatomy = fake_timeline(), FakeAnatomy()
+        self.timeline, self.anatomy = fake_timeline(), FakeAnatomy()
         self.do()
 
     @property
@@ -468,7 +468,7 @@ class FakeRehearsal:
         return self.anatomy.frame
 
     def do(self) -> Frame:
-        self.anatomy.show(self.stepper.newest())
+        self.anatomy.show(self.timeline.newest())
         return self.anatomy.frame
 
 
