@@ -1,4 +1,4 @@
-"""What the user is told of the events of frames."""
+"""Notices of what happened in a frame: undo, bookmarks, refusals, restored states, warnings of a cut."""
 
 from time import perf_counter
 

@@ -133,7 +133,7 @@ class EndLine(_Line):
     summary: dict[str, Any]
 
 
-# The kind of a line is told by its key.
+# The key that only lines of a kind have.
 LINES: dict[str, type[_Line]] = dict(
     command=CommandLine,
     moves=MovesLine,

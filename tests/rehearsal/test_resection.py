@@ -97,7 +97,7 @@ def scored(rehearsal: Rehearsal, marks: np.ndarray) -> None:
 
 
 def cut(rehearsal: Rehearsal, settings: CutSettings = CUT, is_seen=None) -> list[str]:
-    """Cut along the score; return what the user is told."""
+    """Cut along the score; return the notices."""
     return rehearsal.do(cut_command(rehearsal.anatomy, settings, is_seen)).notices
 
 
@@ -247,9 +247,9 @@ def test_a_cut_needs_to_have_seen_the_tumour_and_warns_where_it_saw_little(rehea
     (notice,) = cut(rehearsal, is_seen=coverage.is_seen)
     assert "no part of the tumour was seen" in notice and rehearsal.anatomy.cut is None
     assert cut(rehearsal, is_seen=lambda points: np.arange(len(points)) % 2 == 0) == []
-    told = Notices()
-    Announcements(rehearsal.anatomy, told).observe(rehearsal.frame, rehearsal.case.probe)
-    assert "tumour surface seen 50 %" in told.present()[0]
+    notices = Notices()
+    Announcements(rehearsal.anatomy, notices).observe(rehearsal.frame, rehearsal.case.probe)
+    assert "tumour surface seen 50 %" in notices.present()[0]
 
 
 def test_a_part_that_cannot_be_cut_refuses_the_cut_before_anything_changes(rehearsal, marks, monkeypatch):
@@ -410,7 +410,7 @@ def source_of(
 
 
 def acted(rehearsal: Rehearsal, source: UserSource, **controls) -> list[str]:
-    """The frame after a user's controls; return what the user is told."""
+    """The frame after a user's controls; return the notices."""
     given = Controls(Settings(young_kpa=15.0, iterations=4, substeps=1), **controls)
     frame = rehearsal.do(*source.commands(rehearsal.frame, given, 1 / 60))
     return [*frame.notices, *source.notices.present()]
@@ -423,15 +423,15 @@ def in_patient(rehearsal: Rehearsal, marks: np.ndarray) -> Sequence[tuple[float,
 def test_a_script_acts_at_its_times_and_cuts_but_once(rehearsal, marks):
     score, again = in_patient(rehearsal, marks), ScriptedAction(0.09, score=[(0.0, 0.0, 0.0)])
     actions = ScriptedAction(0.03, score=score), ScriptedAction(0.06, cut=CUT), ScriptedAction(0.08, cut=CUT)
-    source, told, made = source_of(rehearsal, *actions, again), [], []
+    source, notices, made = source_of(rehearsal, *actions, again), [], []
     for _ in range(8):
-        told += acted(rehearsal, source)
+        notices += acted(rehearsal, source)
         frame = rehearsal.frame
         made.append((round(60 * frame.time_s), len(frame.resection.marks), frame.geometry.cut is not None))
     is_scored, is_cut = ([at for at, *done in made if done[which]] for which in (0, 1))
     # A frame of 1/60 s after it is due.
     assert (is_scored[0], is_cut[0]) == (3, 5) and made[-1][1] == len(marks)
-    assert len(told) == 2 and all("cut out already" in notice for notice in told)
+    assert len(notices) == 2 and all("cut out already" in notice for notice in notices)
 
 
 def test_page_score_and_plan_are_written_and_compared(patient, rehearsal, marks, tmp_path, monkeypatch):
@@ -497,12 +497,12 @@ def test_page_score_and_plan_are_written_and_compared(patient, rehearsal, marks,
     assert np.abs(signed_distance_from(case.organ, points)).max() < 0.3
     rehearsal.reset()
     scored(rehearsal, marks[:3])
-    told = acted(rehearsal, source_of(rehearsal, plan=plan), score_planned=True)
+    notices = acted(rehearsal, source_of(rehearsal, plan=plan), score_planned=True)
     planned = rehearsal.frame.resection.points() + rehearsal.case.origin
     assert np.abs(planned - np.array(plan.best.marks_mm)).max() < 0.05
-    assert "for enucleoresection with a margin of 5 mm" in told[0]
-    told = acted(rehearsal, source_of(rehearsal), score_planned=True)
-    assert "no planned line; make a plan" in told[0]
+    assert "for enucleoresection with a margin of 5 mm" in notices[0]
+    notices = acted(rehearsal, source_of(rehearsal), score_planned=True)
+    assert "no planned line; make a plan" in notices[0]
     whole = path.read_text()
     path.write_text(whole.replace('"margin_min_mm"', '"margin_minimum_mm"'))
     with pytest.raises(ResectionPlanError, match="margin_min_mm is no number"):
