@@ -13,6 +13,7 @@ from errors import explained
 from rehearsal.commands.command_line import CommandError
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.configuration import probe_of, with_quality
+from rehearsal.live_settings import DEFAULT_KEYS
 from rehearsal.measurements.uncertainty_bands import UncertaintyBands, UncertaintyError, read_bands
 from rehearsal.planning.plan_file import Plan, PlanError, is_plan, read_plan
 from rehearsal.resection.resection_plan import (
@@ -58,7 +59,7 @@ def read_files(asked: RehearseOptions) -> AskedFiles:
     """Read the files that the user names. Raises UserError, CommandError."""
     path = scene_file(asked.scene)
     scene = load_scene(path)
-    keys = load_keys(asked.keys) if asked.keys else Keys()
+    keys = load_keys(asked.keys, DEFAULT_KEYS) if asked.keys else DEFAULT_KEYS
     asked.check()
     track = load_track(asked.track, asked.track_from) if asked.track else None
     plan = resection_plan = None
@@ -115,7 +116,7 @@ def as_asked(scene: Scene, asked: RehearseOptions) -> tuple[Scene, Probe]:
     Raises SceneError, ProbeError.
     """
     changed = with_quality(with_options(scene, asked.changes), asked.preset)
-    if asked.model is None and changed.tissue.model != scene.tissue.model:
+    if "tissue.model" not in asked.changes and changed.tissue.model != scene.tissue.model:
         click.echo(f"Tissue model: {changed.tissue.model}, as the options ask for it.")
     return changed, probe_of(changed)
 

@@ -3,14 +3,14 @@
 import numpy as np
 
 from rehearsal.deformed_anatomy import DeformedAnatomy
-from rehearsal.settings import initial_settings
+from rehearsal.live_settings import LiveSettings, initial_settings
 from render.display import window_size
 from render.viewer import Geometry
 from render.window import Window
 from render.window_layout import FULL_SIZE
 
 
-def open_viewer(anatomy: DeformedAnatomy, visible: bool) -> Window:
+def open_viewer(anatomy: DeformedAnatomy, visible: bool) -> Window[LiveSettings]:
     """Open a window that shows an anatomy, on the screen or off it. Raises NoVulkan."""
     size = window_size() if visible else FULL_SIZE
     return Window(drawn_geometry(anatomy), initial_settings(anatomy.case), size, visible)
@@ -38,7 +38,6 @@ def drawn_geometry(anatomy: DeformedAnatomy) -> Geometry:
         up=-case.gravity_direction,
         transducer_size_mm=case.size_mm,
         transducer_radius_mm=case.probe.radius_mm,
-        frequency_range_mhz=case.probe.frequency_range_mhz,
         tumour=tumour,
         parts={
             tissue: (vertices, np.asarray(anatomy.geometry.parts[tissue].faces, np.int32))

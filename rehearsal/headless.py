@@ -11,6 +11,7 @@ from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.drawn_geometry import drawn_geometry, open_viewer
 from rehearsal.image_and_surface_files import save_image_file, save_surfaces
 from rehearsal.imaging import image_view
+from rehearsal.live_settings import LiveSettings, with_recorded
 from rehearsal.loop.command import SetValues
 from rehearsal.loop.protocols import Observer, Source
 from rehearsal.measurements.live_measurements import LiveMeasurements
@@ -20,15 +21,13 @@ from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.resection_view import ResectionView, cut_settings
 from rehearsal.result_files import write_json
-from rehearsal.settings import probe_with_settings, set_settings
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer, send_live
 from render.animation import ANIMATION_FPS, empty_folder, save_animation, scaled_down, side_by_side
-from render.viewer import Controls, Settings, View
+from render.viewer import Controls, View, ViewSettings
 from render.window import NoVulkan, Window
 from scenes.atomic_files import atomic_write
 from scenes.terminal import bar
 from ultrasound.persistence import Persistence
-from ultrasound.probe import Probe
 
 # An animation is held in memory: a long session has fewer images in it.
 MOST_SHOWN = 240
@@ -54,7 +53,7 @@ class Pictures:
         self._frames, self._slices = map(empty_folder, folders)
         self._animation: list[Image.Image] = []
 
-    def draw(self, step: int, view: View, settings: Settings, measurements: LiveMeasurements) -> None:
+    def draw(self, step: int, view: View, shown: ViewSettings, measurements: LiveMeasurements) -> None:
         """Draw a step, if its images are due."""
         if step % self._every and step < self.steps:
             return
@@ -64,7 +63,7 @@ class Pictures:
             if self._anatomy.geometry.version != self._version:
                 self._version = self._anatomy.geometry.version
                 self.viewer.change_geometry(drawn_geometry(self._anatomy))
-            self.viewer.draw(measurements.onto(view, settings))
+            self.viewer.draw(measurements.onto(view, shown))
             picture = Image.fromarray(self.viewer.picture())
             save_image_file(picture, self._frames / f"{step:05d}.png")
         if step % self._shown_every == 0 or step == self.steps:
@@ -87,7 +86,7 @@ class HeadlessLoop:
     source: Source
     measurements: LiveMeasurements
     observers: list[Observer]
-    settings: Settings
+    settings: LiveSettings
     tally: Tally
     notices: Notices
     resection: ResectionView
@@ -100,15 +99,15 @@ class HeadlessLoop:
         """Make so many steps; return what was written of images."""
         anatomy = self.rehearsal.anatomy
         pictures = Pictures(anatomy, steps, out) if draws else None
-        step_s, controls = anatomy.case.scene.solver.time_step_s, Controls(self.settings)
+        step_s = anatomy.case.scene.solver.time_step_s
         for step in bar(range(1, steps + 1), "press"):
-            for command in self.source.commands(self.rehearsal.frame, controls, step_s):
+            for command in self.source.commands(self.rehearsal.frame, Controls(self.settings), step_s):
                 if isinstance(command, SetValues):
-                    set_settings(self.settings, command.values)
+                    self.settings = with_recorded(self.settings, command.values)
                 self.rehearsal.timeline.submit(command)
             frame = self.rehearsal.do()
-            probe = probe_with_settings(anatomy.case.probe, self.settings)
-            view = self._view(probe) if draws else None
+            probe = self.settings.probe
+            view = self._view() if draws else None
             if not draws:
                 anatomy.find_plane(probe)
             self.tally.add(self.rehearsal, frame)
@@ -116,15 +115,13 @@ class HeadlessLoop:
                 observer.observe(frame, probe)
             if pictures is not None and view is not None:
                 send_live(self.link, anatomy, view, probe)
-                pictures.draw(step, view, self.settings, self.measurements)
+                pictures.draw(step, view, self.settings.view, self.measurements)
             self.notices.present()
         return [pictures.save()] if pictures is not None else []
 
-    def _view(self, probe: Probe) -> View:
+    def _view(self) -> View:
         """The images of the present frame, with the score and the coming cut."""
-        view = image_view(
-            self.rehearsal.anatomy, probe, self.settings, self.tally.slice_ms, None, self._persistence
-        )
+        view = image_view(self.rehearsal.anatomy, self.settings, self.tally.slice_ms, None, self._persistence)
         view = replace(view, warnings=tuple(f"Import: {text}" for text in self.warnings))
         planned = cut_settings(self.settings)
         self.resection.update(planned, lambda points: self.measurements.coverage.is_seen(points))

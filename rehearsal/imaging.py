@@ -5,11 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from rehearsal.deformed_anatomy import DeformedAnatomy
+from rehearsal.live_settings import LiveSettings
 from rehearsal.stopwatch import timed
-from render.viewer import ScannerSettings, Settings, View
+from render.viewer import View
 from ultrasound.doppler import scale_colours
 from ultrasound.persistence import Persistence
-from ultrasound.probe import Probe
+from ultrasound.probe import DopplerMode, Probe, ScannerSettings
 from ultrasound.scanner import B_MODE, PlaneImages, Scanner
 
 # Figures of speed are medians of so many steps and images.
@@ -18,8 +19,7 @@ RECENT = 30
 
 def image_view(
     anatomy: DeformedAnatomy,
-    probe: Probe,
-    settings: Settings,
+    settings: LiveSettings,
     ms: list[float] | None = None,
     shape: tuple[int, int] | None = None,
     persistence: Persistence | None = None,
@@ -30,17 +30,25 @@ def image_view(
     ``shape`` are the rows and columns of the images, at most the scene's pixels each, which is also the
     default. ``persistence`` is that of the images shown before; without it an image stands alone.
     """
-    scanner, pixels = anatomy.scanner, anatomy.case.scene.image.pixels
-    shown = settings.mode, settings.detail_level, settings.window_hu, settings.level_hu
+    scanner, probe, image = anatomy.scanner, settings.probe, settings.image
+    pixels, outlined = image.pixels, settings.view.outline
 
     def images() -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         if scanner is None:
             return {"no CT": np.zeros((pixels, pixels), np.uint8)}, None
         shown_shape = shape and (min(shape[0], pixels), min(shape[1], pixels))
-        made = scanner.images(anatomy.image_plane(probe), probe, *shown, shown_shape)
+        made = scanner.images(
+            anatomy.image_plane(probe),
+            probe,
+            image.mode,
+            image.detail_level,
+            image.window_hu,
+            image.level_hu,
+            shown_shape,
+        )
         if persistence is not None:
-            made = persistence.mixed(made, settings.persistence_percent / 100)
-        return made.by_name, doppler_of(scanner, made, settings, anatomy.frame.time_s)
+            made = persistence.mixed(made, settings.scanner.persistence_percent / 100)
+        return made.by_name, doppler_of(scanner, made, settings.scanner, anatomy.frame.time_s)
 
     made, doppler = timed(images, [] if ms is None else ms)
     width, depth, above = probe.extent_mm
@@ -48,16 +56,16 @@ def image_view(
         transducer_pose=anatomy.pose,
         images=made,
         doppler=doppler,
-        scale=scale_texts(probe, settings) if doppler is not None else ("", ""),
-        scale_colours=None if doppler is None else scale_colours(settings.doppler),
+        scale=scale_texts(probe, settings.scanner.doppler) if doppler is not None else ("", ""),
+        scale_colours=None if doppler is None else scale_colours(settings.scanner.doppler),
         width_mm=width,
         depth_mm=depth,
         above_mm=above,
         sector=probe.sector,
-        focus_mm=None if settings.mode == "ct" else probe.focus_mm,
-        outline_mm=anatomy.tumour_outline() if settings.outline else None,
-        outline_before_mm=anatomy.tumour_outline(at_rest=True) if settings.outline else None,
-        captions=captions(probe, settings),
+        focus_mm=None if image.mode == "ct" else probe.focus_mm,
+        outline_mm=anatomy.tumour_outline() if outlined else None,
+        outline_before_mm=anatomy.tumour_outline(at_rest=True) if outlined else None,
+        captions=captions(settings),
         title=anatomy.case.scene.title,
     )
 
@@ -71,23 +79,24 @@ def doppler_of(
     return scanner.doppler(images, settings.doppler, time_s, settings.clamped)
 
 
-def scale_texts(probe: Probe, settings: ScannerSettings) -> tuple[str, str]:
+def scale_texts(probe: Probe, mode: DopplerMode) -> tuple[str, str]:
     """Both ends of the scale of Doppler, of velocity in cm/s."""
     limit = f"{probe.velocity_limit_cm_s:.0f}"
-    return ("power", "") if settings.doppler == "power" else (f"+{limit}", f"-{limit}")
+    return ("power", "") if mode == "power" else (f"+{limit}", f"-{limit}")
 
 
-def captions(probe: Probe, settings: ScannerSettings) -> tuple[str, str, str]:
+def captions(settings: LiveSettings) -> tuple[str, str, str]:
     """The probe's name, and the settings of the B-mode image and of the CT."""
+    probe, image, clamped = settings.probe, settings.image, settings.scanner.clamped
     b_mode = (
         f"{probe.frequency_mhz:.1f} MHz   G {probe.gain_percent:.0f} %   DR {probe.dyn_range_db:.0f} dB   "
-        f"{settings.detail_level}{'   hilum clamped' * settings.clamped}"
+        f"{image.detail_level}{'   hilum clamped' * clamped}"
     )
-    ct = f"W {settings.window_hu}   L {settings.level_hu} HU"
+    ct = f"W {image.window_hu:.0f}   L {image.level_hu:.0f} HU"
     return (
         probe.transducer_name,
-        "" if settings.mode == "ct" else b_mode,
-        "" if settings.mode == "b-mode" else ct,
+        "" if image.mode == "ct" else b_mode,
+        "" if image.mode == "b-mode" else ct,
     )
 
 

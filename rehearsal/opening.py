@@ -31,6 +31,7 @@ from scenes.terminal import ReportProgress, stages
 
 if TYPE_CHECKING:
     from rehearsal.deformed_anatomy import DeformedAnatomy
+    from rehearsal.live_settings import LiveSettings
     from rehearsal.real_time.solver_process import SolverProcess
     from rehearsal.rehearsal import Rehearsal
     from rehearsal.run import Built, RehearsalRun
@@ -119,13 +120,13 @@ def solver_process(started: StartedProcess) -> Iterator["SolverProcess"]:
 
 
 @contextmanager
-def window(asked: RehearseOptions, keys: Keys) -> Iterator["Window"]:
+def window(asked: RehearseOptions, keys: Keys) -> Iterator["Window[LiveSettings]"]:
     """An open window that shows progress. Raises CommandError."""
     from render.window import NoVulkan, Window
 
     pad = Gamepad(SdlPads(), keys.buttons) if asked.gamepad else None
     try:
-        opened = Window(size=window_size(), keys=keys, gamepad=pad)
+        opened: Window[LiveSettings] = Window(size=window_size(), keys=keys, gamepad=pad)
     except NoVulkan as reason:
         raise CommandError(f"{reason}; install a Vulkan driver, or run with --headless") from None
     try:
@@ -159,7 +160,7 @@ def built_for_window(
     serial: bool | None,
     arch: str,
     solver: "SolverProcess",
-    viewer: "Window",
+    viewer: "Window[LiveSettings]",
     progress: ReportProgress,
 ) -> "Built":
     """The rehearsal that a window shows.
@@ -168,11 +169,11 @@ def built_for_window(
     """
     from rehearsal.deformed_anatomy import DeformedAnatomy, scanned_ct
     from rehearsal.drawn_geometry import drawn_geometry
+    from rehearsal.live_settings import initial_settings
     from rehearsal.loop.frame import at_rest
     from rehearsal.real_time.solver_loop import SolverSetup
     from rehearsal.rehearsal import begin
     from rehearsal.run import Built
-    from rehearsal.settings import initial_settings
 
     time_step_s = case.scene.solver.time_step_s if asked.rate is None else 1.0 / asked.rate
     pace = Pace(time_step_s, asked.budget_ms or np.inf)
@@ -213,9 +214,9 @@ def check_graphics() -> None:
 def compile_picture(anatomy: "DeformedAnatomy") -> "View":
     """Compute one view in advance, so that the first frame need not wait for its kernels."""
     from rehearsal.imaging import image_view
-    from rehearsal.settings import initial_settings
+    from rehearsal.live_settings import initial_settings
 
-    return image_view(anatomy, anatomy.case.probe, initial_settings(anatomy.case))
+    return image_view(anatomy, initial_settings(anatomy.case))
 
 
 def scene_within_budget(
@@ -232,7 +233,7 @@ def scene_within_budget(
         start_taichi(arch)
         return Rehearsal(case_of(scene_of(files.scene, setup), anatomy, files.probe), anatomy, progress)
 
-    front = front_of(load_points(), asked.model)
+    front = front_of(load_points(), asked.changes.get("tissue.model"))
     _, point, step_ms = choose_within_budget(front, build, asked.budget_ms, asked.error_mm)
     start_taichi(arch)
     text = (

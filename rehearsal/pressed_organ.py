@@ -19,9 +19,9 @@ from rehearsal.resection.score_line import ResectionError
 from rehearsal.stopwatch import timed
 from scenes.anatomy import Grid
 from scenes.mechanical_tissues import mechanical_properties
-from scenes.scene import Attachment, PlaneShape, SceneError
+from scenes.scene import Attachment, Gravity, PlaneShape, SceneError, SolverSection
 from scenes.surfaces import translated
-from scenes.tissue import PartMaterial, PartName
+from scenes.tissue import PartMaterial, PartName, TissueSection
 from sim.attachment import FixedRegion, Pedicle, PerirenalFat, Tether
 from sim.body import BodyState
 from sim.device import backend
@@ -91,7 +91,7 @@ class PressedOrgan:
         self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
         self.settings = step_settings(tissue, section)
         self.young_kpa: float | None = getattr(tissue, "young_kpa", None)
-        self.set_gravity(case.scene.gravity.acceleration_m_s2)
+        self._set_gravity(case.scene.gravity)
 
     def _shape(self, shape: PlaneShape | trimesh.Trimesh | Grid) -> Plane | SignedDistanceField:
         if isinstance(shape, PlaneShape):
@@ -163,15 +163,22 @@ class PressedOrgan:
             else:
                 yield shape.model_dump_json()
 
-    def set_gravity(self, acceleration_m_s2: float) -> None:
-        """Change the acceleration due to gravity; its direction is the scene's."""
-        self.settings.gravity = tuple(1000.0 * acceleration_m_s2 * self.case.gravity_direction)
+    def set(self, tissue: TissueSection, section: SolverSection, gravity: Gravity) -> None:
+        """Change what steps depend on: Young's modulus or stiffness, substeps, iterations, gravity.
 
-    def set_young(self, young_kpa: float) -> None:
-        """Change Young's modulus, if the tissue model has one."""
-        if hasattr(self.model, "set_material"):
+        The direction of gravity stays the scene's.
+        """
+        step = step_settings(tissue, section)
+        self.settings.substeps, self.settings.iterations = step.substeps, step.iterations
+        self.settings.stiffness = step.stiffness
+        self._set_gravity(gravity)
+        young_kpa = getattr(tissue, "young_kpa", None)
+        if young_kpa != self.young_kpa and hasattr(self.model, "set_material"):
             self.young_kpa = young_kpa
             self.model.set_material(young_kpa)
+
+    def _set_gravity(self, gravity: Gravity) -> None:
+        self.settings.gravity = tuple(1000.0 * gravity.acceleration_m_s2 * self.case.gravity_direction)
 
     @contextmanager
     def step_of(self, length_s: float, iterations: int) -> Iterator[None]:

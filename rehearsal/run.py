@@ -16,6 +16,7 @@ from rehearsal.commands.command_line import STOPPED, CommandError
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.headless import HeadlessLoop, run_headless
+from rehearsal.live_settings import LiveSettings, initial_settings
 from rehearsal.loop.command import Checkpoint
 from rehearsal.loop.frame import Checkpointed, Frame
 from rehearsal.loop.protocols import Observer, Source, Stepper
@@ -34,7 +35,6 @@ from rehearsal.sessions.packed_arrays import pack_seen
 from rehearsal.sessions.recorder import SessionRecorder, header_of, next_path
 from rehearsal.sessions.replay import Replay, ReplayCheck, open_session
 from rehearsal.sessions.session_file import Header, Log
-from rehearsal.settings import initial_settings
 from rehearsal.sources.scripted import ReplaySource, ScriptedPress
 from rehearsal.sources.tracker import Tracker, played_pose
 from rehearsal.sources.user import UserSource
@@ -42,7 +42,6 @@ from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer
 from rehearsal.tracking.pose_file import TimedPoses
 from rehearsal.window_loop import WindowLoop
 from rehearsal.window_panel import WindowPanel
-from render.viewer import Settings
 from render.window import Window
 from scenes.anatomy import LoadedAnatomy
 from scenes.import_findings import open_warnings
@@ -85,7 +84,7 @@ class RehearsalRun:
     arch: str
     asked: RehearseOptions
     files: AskedFiles
-    viewer: Window | None = None
+    viewer: Window[LiveSettings] | None = None
     link: OpenIGTLinkServer | None = None
     build_s: float = 0.0
     start: StartTimes = field(default_factory=StartTimes)
@@ -109,7 +108,7 @@ class RehearsalRun:
             raise ValueError("expected a window")
         viewer, log = self.viewer, self.files.log
         check = None if log is None else ReplayCheck(log, self.notices)
-        source = self._user() if log is None else self._replay_in_window(log, viewer.settings, check)
+        source = self._user() if log is None else self._replay_in_window(log, viewer, check)
         text = (
             f"The window is open, {self.start.now_s:.0f} s after the start; {{help}} shows the keys, "
             f"{{quit}} quits."
@@ -158,7 +157,7 @@ class RehearsalRun:
         check = None if log is None else ReplayCheck(log, self.notices)
         if log is not None:
             replay = Replay(log, one_by_one=True)
-            self._open(replay, settings, check)
+            settings = self._open(replay, settings, check)
             source, steps = replay, self._replayed_steps(replay)
         elif self.files.track is not None:
             source, steps = self._tracked(self.files.track)
@@ -248,9 +247,11 @@ class RehearsalRun:
             waits,
         )
 
-    def _replay_in_window(self, log: Log, settings: Settings, check: ReplayCheck | None) -> ReplaySource:
+    def _replay_in_window(
+        self, log: Log, viewer: Window[LiveSettings], check: ReplayCheck | None
+    ) -> ReplaySource:
         replay = Replay(log)
-        self._open(replay, settings, check)
+        viewer.settings = self._open(replay, viewer.settings, check)
         return ReplaySource(replay, self._take_over, self.notices)
 
     def _take_over(self) -> UserSource:
@@ -258,10 +259,11 @@ class RehearsalRun:
         self.manipulator.match(self.anatomy.pose)
         return self._user(waits=True)
 
-    def _open(self, replay: Replay, settings: Settings, check: ReplayCheck | None) -> None:
+    def _open(self, replay: Replay, settings: LiveSettings, check: ReplayCheck | None) -> LiveSettings:
+        """Take the rehearsal to where the replay begins; return the settings there."""
         _echo(replay_warning(replay.log.header, self.arch))
         observers: list[Observer] = [self.measurements] if check is None else [self.measurements, check]
-        open_session(
+        return open_session(
             replay, self.asked.at, self.built.stepper, self.anatomy, settings, self.measurements, observers
         )
 

@@ -14,14 +14,14 @@ from time import perf_counter
 from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.drawn_geometry import drawn_geometry
 from rehearsal.imaging import image_view
+from rehearsal.live_settings import LiveSettings, with_recorded
 from rehearsal.loop.command import SetValues
 from rehearsal.loop.frame import Frame
 from rehearsal.loop.protocols import Observer, Source, Stepper
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.real_time.frame_times import FrameTimes
-from rehearsal.settings import probe_with_settings, set_settings
 from rehearsal.window_panel import WindowPanel
-from render.viewer import Controls, ScannerSettings, View
+from render.viewer import Controls, View
 from render.window import Window
 from ultrasound.persistence import Persistence
 from ultrasound.probe import Probe
@@ -40,7 +40,7 @@ MOST_TIMES = 100
 class WindowLoop:
     """A rehearsal in a window: ``run`` until it is closed. While it is frozen the solver makes no step."""
 
-    window: Window
+    window: Window[LiveSettings]
     stepper: Stepper
     source: Source
     anatomy: DeformedAnatomy
@@ -66,20 +66,21 @@ class WindowLoop:
                 self._submit(frame, controls)
             with self.times.stage("last state"):
                 self._use_waiting_time(frame, probe, view)
-            probe = probe_with_settings(self.anatomy.case.probe, controls.settings)
-            self._announce_new_kind(view, controls.settings)
+            settings = self.window.settings
+            probe = settings.probe
+            self._announce_new_kind(view, settings)
             with self.times.stage("state"):
                 frame = self._newest()
             with self.times.stage("image"):
-                view = self._image(probe, controls)
+                view = self._image(settings)
             with self.times.stage("panel"):
-                view = self.panel.present(view, probe, controls, self.times, self._image_ms)
+                view = self.panel.present(view, settings, controls, self.times, self._image_ms)
             with self.times.stage("drawing"):
                 self.window.draw(view)
             self._end(frame, view, controls)
         self._observe(frame, probe)
 
-    def _controls(self) -> Controls:
+    def _controls(self) -> Controls[LiveSettings]:
         """The user's controls; freeze is a toggle, which what changes the tissue ends."""
         controls = self.window.read_controls()
         ends_freeze = controls.restores or controls.operates or controls.take_over
@@ -89,7 +90,7 @@ class WindowLoop:
         self.panel.control(controls, self.frozen)
         return replace(controls, frozen=self.frozen)
 
-    def _submit(self, frame: Frame, controls: Controls) -> None:
+    def _submit(self, frame: Frame, controls: Controls[LiveSettings]) -> None:
         now, before = perf_counter(), self._input_at_s
         self._input_at_s = now
         step_s = self.anatomy.case.scene.solver.time_step_s
@@ -97,7 +98,7 @@ class WindowLoop:
         for command in self.source.commands(frame, controls, elapsed_s):
             if isinstance(command, SetValues):
                 # Those of a replay are the window's too.
-                set_settings(controls.settings, command.values)
+                self.window.settings = with_recorded(self.window.settings, command.values)
             self.stepper.submit(command)
 
     def _use_waiting_time(self, frame: Frame, probe: Probe, view: View | None) -> None:
@@ -123,26 +124,26 @@ class WindowLoop:
             self.panel.forget_images()
         return frame
 
-    def _image(self, probe: Probe, controls: Controls) -> View:
+    def _image(self, settings: LiveSettings) -> View:
         """The images, also of frozen tissue with other settings; of an earlier frame those that it had.
 
         They have the pixels of their boxes in the window, unless they are recorded or sent too.
         """
         if self.panel.shows_earlier:
             return self.panel.cine.shown.view
-        settings = controls.settings
-        count, (width, depth, _) = len(IMAGES_OF_MODE[settings.mode]), probe.extent_mm
+        count, (width, depth, _) = len(IMAGES_OF_MODE[settings.image.mode]), settings.probe.extent_mm
         shape = self.window.image_shape(count, width, depth) if self.panel.only_shows else None
-        view = image_view(self.anatomy, probe, settings, self._image_ms, shape, self._persistence)
+        view = image_view(self.anatomy, settings, self._image_ms, shape, self._persistence)
         del self._image_ms[:-MOST_TIMES]
         return view
 
-    def _announce_new_kind(self, view: View | None, settings: ScannerSettings) -> None:
+    def _announce_new_kind(self, view: View | None, settings: LiveSettings) -> None:
         """Say over the last image that one of a new kind is prepared: compiling its kernels may take
         seconds.
         """
-        steered = settings.colour_steering_deg != 0
-        kind = settings.mode, settings.detail_level, settings.compounding, settings.doppler, steered
+        probe, image = settings.probe, settings.image
+        is_steered, is_compounded = probe.colour_steering_deg != 0, probe.compound_angles > 1
+        kind = image.mode, image.detail_level, is_compounded, settings.scanner.doppler, is_steered
         if view is not None and kind not in self._kinds:
             self.window.draw(replace(view, status=PREPARING))
         self._kinds.add(kind)
@@ -150,4 +151,4 @@ class WindowLoop:
     def _end(self, frame: Frame, view: View, controls: Controls) -> None:
         input_s = frame.steps[-1].input_s if frame.steps and not self.frozen else None
         self.times.end_frame(frame.time_s, input_s or None)
-        self.panel.save(controls, view, self.window.picture)
+        self.panel.save(controls, self.window.settings, view, self.window.picture)

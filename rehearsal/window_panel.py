@@ -17,19 +17,19 @@ from rehearsal.cine import Cine, CineFrame
 from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.image_and_surface_files import save_screenshot, save_surfaces, save_view
 from rehearsal.imaging import image_view, readouts
+from rehearsal.live_settings import LiveSettings
 from rehearsal.loop.protocols import Source
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.notices import Notices
 from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.resection.resection_view import ResectionView, cut_settings
-from rehearsal.settings import probe_with_settings
 from rehearsal.sources.scripted import ReplaySource
 from rehearsal.sources.user import UserSource
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer, send_live
 from rehearsal.tracking.sweep_recording import SweepRecorder
 from render.keys import Keys
-from render.viewer import Controls, Settings, View
+from render.viewer import Controls, View
 from scenes.import_findings import acknowledge
 from scenes.scene import SceneError
 from ultrasound.probe import Probe
@@ -95,7 +95,7 @@ class WindowPanel:
         """The frames of the cine memory show other surfaces."""
         self.cine = Cine()
 
-    def control(self, controls: Controls, frozen: bool) -> None:
+    def control(self, controls: Controls[LiveSettings], frozen: bool) -> None:
         """Do what the keys ask for before the frame."""
         self._frozen = frozen
         if frozen:
@@ -108,10 +108,15 @@ class WindowPanel:
         self.plans.control(controls)
 
     def present(
-        self, view: View, probe: Probe, controls: Controls, times: FrameTimes, image_ms: list[float]
+        self,
+        view: View,
+        settings: LiveSettings,
+        controls: Controls,
+        times: FrameTimes,
+        image_ms: list[float],
     ) -> View:
         """The view with all that the user reads, sent over the link, and kept in the cine memory."""
-        settings, time_s = controls.settings, self.anatomy.frame.time_s
+        probe, time_s = settings.probe, self.anatomy.frame.time_s
         if not self._frozen:
             self.sweeping.add(time_s, view, probe)
         if controls.sweep:
@@ -136,7 +141,7 @@ class WindowPanel:
             notes={name: self._with_hint(note) for name, note in view.notes.items()},
         )
 
-    def with_resection(self, view: View, settings: Settings) -> View:
+    def with_resection(self, view: View, settings: LiveSettings) -> View:
         """A view with the score and the coming cut."""
         planned = cut_settings(settings)
         self.resection.update(planned, lambda points: self.measurements.coverage.is_seen(points))
@@ -145,18 +150,20 @@ class WindowPanel:
             return view
         return replace(view, score=score, resection_mm=self.resection.section())
 
-    def save(self, controls: Controls, view: View, picture: Callable[[], np.ndarray]) -> None:
+    def save(
+        self, controls: Controls, settings: LiveSettings, view: View, picture: Callable[[], np.ndarray]
+    ) -> None:
         """Save the files that the user asks for."""
         if controls.screenshot:
             self._try(lambda: save_screenshot(picture(), self.out))
         if controls.export:
-            self._try(partial(self._export, controls.settings, view))
+            self._try(partial(self._export, settings, view))
 
-    def _measured(self, view: View, probe: Probe, settings: Settings) -> CineFrame:
+    def _measured(self, view: View, probe: Probe, settings: LiveSettings) -> CineFrame:
         """The view with its measurements, sent over the link and, unless frozen, kept in the cine memory."""
         send_live(self.link, self.anatomy, view, probe)
         rest = self.anatomy.rest_grid()
-        shown = CineFrame(perf_counter(), self.measurements.onto(view, settings), rest)
+        shown = CineFrame(perf_counter(), self.measurements.onto(view, settings.view), rest)
         if not self._frozen:
             self.cine.keep(shown)
         return shown
@@ -183,7 +190,7 @@ class WindowPanel:
             return note
         return self.keys.worded(f"{note}\n{HOW_TO_PRESS}")
 
-    def _status(self, view: View, settings: Settings) -> str:
+    def _status(self, view: View, settings: LiveSettings) -> str:
         """The text over the images, the most important first: text that does not fit is cut at the end."""
         restored = "STATE RESTORED" if self.announcements.has_restored else ""
         is_new = perf_counter() < self._notice_until
@@ -216,14 +223,13 @@ class WindowPanel:
         self.warnings = ()
         self.notices.post("warnings of the import acknowledged")
 
-    def _export(self, settings: Settings, view: View) -> None:
+    def _export(self, settings: LiveSettings, view: View) -> None:
         """Save images and surfaces; say what is missing, and why. Raises OSError."""
-        probe = probe_with_settings(self.anatomy.case.probe, settings)
         if self.only_shows and not self.shows_earlier:
             # With all pixels of the scene.
-            whole = image_view(self.anatomy, probe, settings)
+            whole = image_view(self.anatomy, settings)
             view = replace(view, images=whole.images, doppler=whole.doppler)
-        begin, missing = save_view(view, probe, self.out), []
+        begin, missing = save_view(view, settings.probe, self.out), []
         if view.notes.keys() & view.images.keys():
             missing.append("B-mode image black: the probe does not touch the organ")
         if self.shows_earlier:

@@ -11,7 +11,7 @@ from itertools import islice
 import numpy as np
 from PIL import Image, ImageDraw
 
-from render.keys import Keys
+from render.keys import Keys, default_keys
 from render.text import fitting_size, font, shortened
 from render.ultrasound_panel import (
     ALERT,
@@ -65,7 +65,7 @@ class BackgroundImage:
     """
 
     def __init__(self, layout: WindowLayout, keys: Keys | None = None) -> None:
-        self.layout, self.keys = layout, keys or Keys()
+        self.layout, self.keys = layout, keys or default_keys()
         self.pixels = np.full((layout.width, layout.height, 4), 255, dtype=np.uint8)
         # The same memory as rows, top down, for drawing.
         self._rows = self.pixels.transpose(1, 0, 2)[::-1]

@@ -2,17 +2,16 @@
 
 import re
 import string
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from errors import UserError, explained, meant
-from render.viewer import TECHNIQUES, Controls
+from render.viewer import Controls, UserSettings
+from settings import Setting, live_settings, value_of, with_values
 from text_files import TextError, read_toml
-from ultrasound.probe import DETAIL_LEVELS, DOPPLER_MODES, MODES
-from ultrasound.target import TARGETS
 
 # A key as printed -> as GGUI names it. GGUI reports no digits and no punctuation.
 KEYS = {each: each.lower() for each in string.ascii_uppercase}
@@ -26,7 +25,8 @@ BUTTONS = (
     *("A", "B", "X", "Y", "Back", "Guide", "Start", "Left stick", "Right stick"),
     *("Left shoulder", "Right shoulder", "Pad up", "Pad down", "Pad left", "Pad right"),
 )
-# Group -> text for the user -> actions, each with its key as printed.
+# Group -> text for the user -> actions, each with its key as printed; those of settings are declared beside
+# these.
 KEY_MAP = {
     "Transducer": {
         "move it over the organ": {"point": "Mouse"},
@@ -40,16 +40,8 @@ KEY_MAP = {
         "turn the view": {"orbit": "Right drag"},
         "pan the view (also Shift + right drag)": {"pan": "Middle drag"},
         "zoom in and out": {"zoom_in": "Up", "zoom_out": "Down"},
-        "organ translucent or solid": {"translucent": "T"},
-        "organ cut along the image plane": {"cut": "X"},
-        "coverage: imaged tissue in green": {"show_seen": "N"},
     },
     "Image": {
-        "B-mode and CT, B-mode alone, CT alone": {"mode": "B"},
-        "detail level of the B-mode image": {"detail_level": "V"},
-        "Doppler: colour, power, off": {"doppler": "Tab"},
-        "the scanner's sliders, with TGC": {"show_scanner": "G"},
-        "outline of the tumour, now and in the CT": {"outline": "O"},
         "caliper from click to click, in mm; a third removes it": {"measure": "Click on image"},
         "freeze and unfreeze": {"freeze": "F"},
         "while frozen: cine of the last ten seconds": {"cine_back": "Left", "cine_forth": "Right"},
@@ -59,12 +51,9 @@ KEY_MAP = {
         "score: a mark on the organ": {"score_under": "Shift+Left button"},
         "score: marks beside the tumour's edges in the image": {"score_image": "Shift+M"},
         "score: the marks of the planned line, instead of any others": {"score_planned": "Shift+L"},
-        "technique: enucleoresection, wedge, enucleation": {"technique": "Shift+T"},
-        "depth of the cut; air or fluid in the crater": {"show_resection": "Shift+G"},
         "cut along the score": {"cut_out": "Shift+X"},
     },
     "Plan": {
-        "target: tumour and margin, tumour, kidney": {"plan_for": "Space"},
         "plan a sweep of the target": {"plan": "Return"},
         "stop planning; or show the next sweep, then none": {"next_plan": "Backspace"},
     },
@@ -80,9 +69,6 @@ KEY_MAP = {
         "quit": {"quit": "Esc"},
     },
 }
-_ALL = {action: key for group in KEY_MAP.values() for keys in group.values() for action, key in keys.items()}
-MOUSE = {action: place for action, place in _ALL.items() if place not in KEYS}
-DEFAULT_KEYS = {action: key for action, key in _ALL.items() if key in KEYS}
 DEFAULT_BUTTONS = {
     "freeze": "A",
     "undo": "B",
@@ -107,16 +93,9 @@ HELD = {
     "tilt_back": ("tilt_deg", -TILT_DEG_S),
     "tilt_forward": ("tilt_deg", TILT_DEG_S),
 }
-# The others act when the key goes down: cine steps, settings of several values, settings that are on or off,
-# and controls with the name of the action.
+# The others act when the key goes down: cine steps, settings with a key, and controls with the name of the
+# action.
 STEPS = {"cine_back": -1, "cine_forth": 1}
-CYCLES = {
-    "mode": MODES,
-    "detail_level": DETAIL_LEVELS,
-    "doppler": DOPPLER_MODES,
-    "plan_for": TARGETS,
-    "technique": TECHNIQUES,
-}
 # Actions of the 3D view itself.
 VIEW_ACTIONS = ("zoom_in", "zoom_out")
 
@@ -141,10 +120,20 @@ class _File(BaseModel):
 
 @dataclass(frozen=True)
 class Keys:
-    """``of`` is action -> key, ``buttons`` action -> gamepad button, both as printed."""
+    """The keys of a window.
 
-    of: Mapping[str, str] = field(default_factory=lambda: DEFAULT_KEYS)
+    ``groups`` has group -> text for the user -> actions, ``of`` action -> key or place of the mouse,
+    ``buttons`` action -> gamepad button, all as printed.
+    """
+
+    groups: Mapping[str, Mapping[str, tuple[str, ...]]]
+    of: Mapping[str, str]
     buttons: Mapping[str, str] = field(default_factory=lambda: DEFAULT_BUTTONS)
+
+    @property
+    def keyed(self) -> dict[str, str]:
+        """The actions that have a key."""
+        return {action: place for action, place in self.of.items() if place in KEYS}
 
     def action_of(self, pressed: str, with_shift: bool = False) -> str:
         """Return the action of a key, as GGUI names it; empty where it has none.
@@ -152,7 +141,7 @@ class Keys:
         A key that has none with shift has its usual one.
         """
         names = (WITH_SHIFT + pressed, pressed) if with_shift else (pressed,)
-        of = {KEYS[key]: action for action, key in self.of.items()}
+        of = {KEYS[key]: action for action, key in self.keyed.items()}
         return next((of[name] for name in names if name in of), "")
 
     def held(self) -> list[tuple[str, str]]:
@@ -162,64 +151,78 @@ class Keys:
     def lines(self) -> dict[str, list[tuple[str, str]]]:
         """Return keys and texts of all actions by group, for the help."""
         return {
-            group: [
-                (" / ".join(self.of.get(*usual) for usual in keys.items()), text)
-                for text, keys in lines.items()
-            ]
-            for group, lines in KEY_MAP.items()
+            group: [(" / ".join(map(self.of.__getitem__, actions)), text) for text, actions in lines.items()]
+            for group, lines in self.groups.items()
         }
 
     def worded(self, text: str) -> str:
         """Return a text with actions in braces replaced by their keys: "{sweep} stops it"."""
-        words = {**MOUSE, **self.of}
-        return re.sub(r"\{(\w+)\}", lambda found: words.get(found[1], found[0]), text)
+        return re.sub(r"\{(\w+)\}", lambda braces: self.of.get(braces[1], braces[0]), text)
 
 
-def load_keys(path: Path) -> Keys:
-    """Return the keys of a TOML file, with defaults for those it leaves out. Raises KeysError."""
+def default_keys(settings: Iterable[Setting] = ()) -> Keys:
+    """The default keys of the window's own actions, and of settings."""
+    of = {
+        action: key for lines in KEY_MAP.values() for keys in lines.values() for action, key in keys.items()
+    }
+    groups: dict[str, dict[str, tuple[str, ...]]] = {group: {} for group in KEY_MAP}
+    for setting in settings:
+        if setting.key is not None:
+            groups[setting.key.group][setting.key.text] = (setting.name,)
+            of[setting.name] = setting.key.key
+    for group, lines in KEY_MAP.items():
+        groups[group] |= {text: tuple(keys) for text, keys in lines.items()}
+    return Keys(groups, of)
+
+
+def load_keys(path: Path, usual: Keys) -> Keys:
+    """Return the keys of a TOML file, and the usual ones of those that it leaves out. Raises KeysError."""
     try:
-        given = _File.model_validate(read_toml(path))
+        file = _File.model_validate(read_toml(path))
     except (FileNotFoundError, NotADirectoryError):
         raise KeysError(f"{path}: no such key file; app.py keys prints one to start from") from None
     except TextError as error:
         raise KeysError(f"{path}: cannot be read as a TOML key file ({error})") from None
     except ValidationError as error:
         raise KeysError(f"{path}: {explained(error, lambda _: SECTIONS)}") from None
+    mouse = usual.of.keys() - usual.keyed.keys()
+    buttons = [action for action in usual.keyed if action not in (*VIEW_ACTIONS, "help")]
     try:
-        buttons = [action for action in DEFAULT_KEYS if action not in (*VIEW_ACTIONS, "help")]
-        return Keys(
-            _with("keys", given.keys, DEFAULT_KEYS, DEFAULT_KEYS, KEYS),
-            _with("gamepad", given.gamepad, DEFAULT_BUTTONS, buttons, BUTTONS),
+        return replace(
+            usual,
+            of=dict(usual.of) | _with("keys", file.keys, usual.keyed, usual.keyed, KEYS, mouse),
+            buttons=_with("gamepad", file.gamepad, usual.buttons, buttons, BUTTONS, mouse),
         )
     except KeysError as error:
         raise KeysError(f"{path}: {error}") from None
 
 
-def keys_text() -> str:
-    """Return the default keys as the TOML file that ``load_keys`` reads."""
+def keys_text(keys: Keys) -> str:
+    """Return keys as the TOML file that ``load_keys`` reads."""
     named = ", ".join(key for key in KEYS if len(key) > 1 and not key.startswith(WITH_SHIFT))
-    head = HEAD.format(named=named, buttons=", ".join(BUTTONS))
-    rows = []
-    for group, lines in KEY_MAP.items():
+    rows = [HEAD.format(named=named, buttons=", ".join(BUTTONS)), "[keys]"]
+    for group, lines in keys.groups.items():
         rows.append(f"# {group}")
-        keyed = [(action, text) for text, keys in lines.items() for action in keys if action in DEFAULT_KEYS]
-        rows += [f'{action} = "{DEFAULT_KEYS[action]}"  # {text}' for action, text in keyed]
-    pad = [f'{action} = "{button}"' for action, button in DEFAULT_BUTTONS.items()]
-    return "\n".join([head, "[keys]", *rows, "", "[gamepad]", *pad, ""])
+        texts = {action: text for text, actions in lines.items() for action in actions}
+        keyed = [action for action in texts if action in keys.keyed]
+        rows += [f'{action} = "{keys.of[action]}"  # {texts[action]}' for action in keyed]
+    pad = [f'{action} = "{button}"' for action, button in keys.buttons.items()]
+    return "\n".join([*rows, "", "[gamepad]", *pad, ""])
 
 
 def _with(
     section: str,
-    given: Mapping[str, str],
+    changes: Mapping[str, str],
     usual: Mapping[str, str],
     actions: Iterable[str],
     places: Iterable[str],
+    mouse: Collection[str],
 ) -> dict[str, str]:
-    """Return the default keys or buttons of actions, replaced by those given. Raises KeysError."""
+    """Return the usual keys or buttons of actions, with some changed. Raises KeysError."""
     printed = {place.lower(): place for place in places}
     chosen = dict(usual)
-    for action, place in given.items():
-        if action in MOUSE:
+    for action, place in changes.items():
+        if action in mouse:
             raise KeysError(f"{section}.{action}: is an action of the mouse; leave it out")
         if action not in actions:
             raise KeysError(f"{section}.{action}: unknown action; {meant(action, actions)}")
@@ -250,14 +253,17 @@ def hold(action: str, controls: Controls, seconds: float) -> None:
 
 def begin(action: str, controls: Controls) -> None:
     """Apply an action whose key went down; ignore held actions and those of the window itself."""
-    settings = controls.settings
+    keyed = {setting.name: setting for setting in live_settings(controls.settings) if setting.key is not None}
     if action in STEPS:
         controls.cine += STEPS[action]
-    elif action in CYCLES:
-        values = CYCLES[action]
-        at = values.index(getattr(settings, action))
-        setattr(settings, action, values[(at + 1) % len(values)])
-    elif hasattr(settings, action):
-        setattr(settings, action, not getattr(settings, action))
+    elif action in keyed:
+        controls.settings = with_next(controls.settings, keyed[action])
     elif hasattr(controls, action):
         setattr(controls, action, True)
+
+
+def with_next(settings: UserSettings, setting: Setting) -> UserSettings:
+    """Settings with the next value of one that has few, the first after the last."""
+    values = setting.choices
+    following = values[(values.index(value_of(settings, setting)) + 1) % len(values)]
+    return with_values(settings, {setting.path: following})

@@ -12,7 +12,7 @@ from render import transducer_shape
 from render.camera import OrbitCamera
 from render.cut_face import CutFace, side_of_eye
 from render.surface_shading import CUT_EDGE_MM, GLASS, SOLID, Cut, DrawnMesh, ShadedSurface
-from render.viewer import Geometry, Guidance, Score, Settings, View
+from render.viewer import Geometry, Guidance, Score, View, ViewSettings
 from sim.fields import field_of, fill, zeros
 
 PLANE_ROWS, PLANE_COLUMNS = 96, 64
@@ -78,7 +78,7 @@ class SceneView:
         return support
 
     def draw(
-        self, scene, view: View, settings: Settings, masked: Sequence[tuple[float, float, float, float]] = ()
+        self, scene, view: View, shown: ViewSettings, masked: Sequence[tuple[float, float, float, float]] = ()
     ) -> None:
         """Draw everything into `scene`, in the order that depth and blending need.
 
@@ -92,15 +92,15 @@ class SceneView:
         scene.point_light((eye + distance * (0.9 * right - 0.2 * up)).tolist(), FILL_LIGHT)
         if masked:
             self._mask(scene, masked)
-        if self._support is not None and settings.show_support:
+        if self._support is not None and shown.show_support:
             # A decimated mesh has slivers that face the wrong way, which would appear as black specks.
             self._support.draw(scene, two_sided=True)
         if self._specimen is not None:
             self._specimen.shade(eye, key)
             self._specimen.draw(scene)
         self._draw_transducer(scene, view.transducer_pose)
-        inner = self._inner(view, settings)
-        cut = self._draw_cut_face(scene, view, inner, eye, key) if settings.cut else None
+        inner = self._inner(view, shown)
+        cut = self._draw_cut_face(scene, view, inner, eye, key) if shown.cut else None
         if cut is None:
             self._cut_side = 0.0
             self._draw_inner(scene, inner, eye, key, ahead)
@@ -113,22 +113,22 @@ class SceneView:
         if view.score is not None:
             self.score_lines = self.score_lines or ScoreLines()
             self.score_lines.draw(scene, view.score, toward=-ahead)
-        if self._bed is not None and settings.translucent and cut is None:
+        if self._bed is not None and shown.translucent and cut is None:
             # A crater in a translucent surface is not seen.
             self._bed.shade(eye, key)
             self._bed.draw(scene)
-        opacity = GLASS if settings.translucent else SOLID
+        opacity = GLASS if shown.translucent else SOLID
         self._organ.tint(view.seen.get("organ"))
         self._organ.shade(eye, key, opacity, cut)
         self._organ.draw(scene, ahead if opacity < SOLID or cut is not None else None, cut)
 
-    def _inner(self, view: View, settings: Settings) -> list[ShadedSurface]:
+    def _inner(self, view: View, shown: ViewSettings) -> list[ShadedSurface]:
         """Return the shown surfaces inside the organ."""
-        shown = list(self._parts) if settings.show_parts else []
-        if self._tumour is not None and settings.show_tumour:
+        surfaces = list(self._parts) if shown.show_parts else []
+        if self._tumour is not None and shown.show_tumour:
             self._tumour.tint(view.seen.get("tumour"))
-            shown.append(self._tumour)
-        return shown
+            surfaces.append(self._tumour)
+        return surfaces
 
     def _draw_inner(
         self, scene, inner: list[ShadedSurface], eye, key, ahead: np.ndarray, cut: Cut | None = None

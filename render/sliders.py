@@ -1,58 +1,74 @@
-"""Sliders and switches from the metadata of ``Settings``: in the strip under the 3D view; the scanner's
-beside the panel.
+"""Sliders, switches and buttons of the settings that have a ``Control``: in the strip under the 3D view; the
+scanner's beside the panel.
 """
 
-import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
-from render.viewer import B_MODE, DOPPLER, RESECTION, SCANNER_GROUPS, TGC, Geometry, Settings
+import numpy as np
+
+from render.keys import with_next
+from render.viewer import (
+    B_MODE,
+    DOPPLER,
+    RESECTION,
+    TGC,
+    Geometry,
+    UserSettings,
+    WindowSettings,
+)
 from render.window_layout import Rect, WindowLayout
+from settings import Setting, live_settings, section_of, value_of, with_values
 
-# Dear ImGui's glyphs are 7 pixels wide, its rows 23 pixels high. A slider's label gets 35 % of a box, a
-# switch's all of it, less these pixels around them.
+# Groups in the strip, in their order; where these are too wide, the first are left out.
+STRIP = ("Tissue", "Image", "View")
+# Dear ImGui's glyphs are 7 pixels wide, its rows 23 pixels high. A slider's label gets 35 % of a box, that of
+# a switch or a button all of it, less these pixels around them.
 GLYPH_WIDTH, LABEL_SHARE, ROW_HEIGHT, AROUND_ROWS = 7, 0.35, 23, 32
 AROUND_LABEL, AROUND_SWITCH = 16, 35
 # The least width of a box beside the panel.
 LEAST_WIDTH = 120
 
+Groups = dict[str, list[Setting]]
 
-def groups_of(settings: Settings, geometry: Geometry) -> dict[str, list[dataclasses.Field]]:
-    """Return the adjustable settings by group."""
+
+def groups_of(settings: WindowSettings, geometry: Geometry) -> Groups:
+    """Return the settings with a control, by group."""
     # Settings of structures that the scene does not have.
     unused = {"show_tumour", "outline", "margin_mm"} if geometry.tumour is None else set()
     unused |= set() if geometry.parts else {"show_parts"}
     unused |= {"show_support"} if geometry.support is None else set()
-    groups: dict[str, list[dataclasses.Field]] = {}
-    for each in dataclasses.fields(settings):
-        if each.metadata and getattr(settings, each.name) is not None and each.name not in unused:
-            groups.setdefault(each.metadata["group"], []).append(each)
+    groups: Groups = {}
+    for setting in live_settings(settings):
+        if setting.control is not None and setting.name not in unused:
+            groups.setdefault(setting.control.group, []).append(setting)
     return groups
 
 
-def boxes_of(settings: Settings, geometry: Geometry, layout: WindowLayout) -> dict[str, Rect]:
+def boxes_of(settings: WindowSettings, geometry: Geometry, layout: WindowLayout) -> dict[str, Rect]:
     """Return the box of each group.
 
     Where boxes would be too narrow for their labels, the first are left out.
     """
     groups = groups_of(settings, geometry)
-    widths = {name: _width(members) for name, members in groups.items() if name not in SCANNER_GROUPS}
+    widths = {name: _width(settings, groups[name]) for name in STRIP if name in groups}
     while len(widths) > 1 and sum(widths.values()) > layout.slider_room(len(widths)):
         del widths[next(iter(widths))]
     boxes = dict(zip(widths, layout.sliders(list(widths.values())), strict=True))
-    shown = [RESECTION] if settings.show_resection else []
-    shown += [B_MODE, TGC if settings.doppler == "off" else DOPPLER] if settings.show_scanner else []
-    return boxes | _beside_panel({name: groups[name] for name in shown}, layout)
+    names = [RESECTION] if settings.resection.show_resection else []
+    if settings.view.show_scanner:
+        names += [B_MODE, TGC if settings.scanner.doppler == "off" else DOPPLER]
+    return boxes | _beside_panel(settings, {name: groups[name] for name in names}, layout)
 
 
 def draw_sliders(
     gui,
-    settings: Settings,
+    settings: UserSettings,
     geometry: Geometry,
     boxes: dict[str, Rect],
     first_size: tuple[int, int],
     moved: Mapping[str, int],
-) -> None:
-    """Draw the groups that have a box, and update the settings from them.
+) -> UserSettings:
+    """Draw the groups that have a box; return the settings as the user leaves them.
 
     GGUI measures in fractions of the window's first size. A box stays where the user moved it, and is never
     freed: there is a new one only in a new place, or where the user ``moved`` it once more.
@@ -63,24 +79,46 @@ def draw_sliders(
         place = (box.left / width, box.top / height, box.width / width, box.height / height)
         # Dear ImGui shows what stands before "##", and knows a box by all of it.
         with gui.sub_window(f"{name}##{moved.get(name, 0)} {tuple(box)}", *place):
-            for member in groups[name]:
-                value, about, label = getattr(settings, member.name), member.metadata, _label(member)
-                low, high = about["low"], about["high"]
-                if member.name == "frequency_mhz":
-                    low, high = geometry.frequency_range_mhz
-                if isinstance(low, bool):
-                    value = gui.checkbox(label, bool(value))
-                elif isinstance(low, int):
-                    value = gui.slider_int(label, int(value), low, high)
-                else:
-                    value = gui.slider_float(label, float(value), low, high)
-                setattr(settings, member.name, value)
+            for setting in groups[name]:
+                settings = _drawn(gui, settings, setting)
+    return settings
 
 
-def _beside_panel(groups: dict[str, list[dataclasses.Field]], layout: WindowLayout) -> dict[str, Rect]:
+def _drawn(gui, settings: UserSettings, setting: Setting) -> UserSettings:
+    """Draw the control of a setting; return the settings as the user leaves them."""
+    value, labels = value_of(settings, setting), _labels(settings, setting)
+    if isinstance(value, bool):
+        changed = gui.checkbox(labels[0], value)
+    elif setting.choices:
+        return with_next(settings, setting) if gui.button(labels[0]) else settings
+    else:
+        limits = setting.limits_in(section_of(settings, setting))
+        numbers = value if isinstance(value, tuple) else (value,)
+        slid = [_slid(gui, *of, setting.is_whole, *limits) for of in zip(labels, numbers, strict=True)]
+        changed = tuple(slid) if isinstance(value, tuple) else slid[0]
+    return settings if changed == value else with_values(settings, {setting.path: changed})
+
+
+def _slid(gui, label: str, value: float, is_whole: bool, low: float, high: float) -> float:
+    """A number as its slider leaves it: the same one, unless the user moves it."""
+    shown: float
+    if is_whole or isinstance(value, int):
+        shown = round(value)
+        slid = gui.slider_int(label, shown, round(low), round(high))
+    else:
+        # A slider has single precision.
+        shown = float(np.float32(value))
+        slid = gui.slider_float(label, shown, low, high)
+    return value if slid == shown else type(value)(min(max(slid, low), high))
+
+
+def _beside_panel(settings: WindowSettings, groups: Groups, layout: WindowLayout) -> dict[str, Rect]:
     """Return the boxes of the scanner's groups; the last are left out where findings would be covered."""
     sizes = {
-        name: (max(LEAST_WIDTH, round(_width(members))), ROW_HEIGHT * len(members) + AROUND_ROWS)
+        name: (
+            max(LEAST_WIDTH, round(_width(settings, members))),
+            ROW_HEIGHT * sum(len(_labels(settings, member)) for member in members) + AROUND_ROWS,
+        )
         for name, members in groups.items()
     }
     boxes = layout.scanner_sliders(list(sizes.values()))
@@ -90,17 +128,24 @@ def _beside_panel(groups: dict[str, list[dataclasses.Field]], layout: WindowLayo
     return dict(zip(sizes, boxes, strict=True))
 
 
-def _width(members: list[dataclasses.Field]) -> float:
+def _width(settings: WindowSettings, members: Sequence[Setting]) -> float:
     """Return the width that a group needs for its labels [pixels]."""
-    return max(_width_of(member) for member in members)
+    return max(_width_of(settings, member) for member in members)
 
 
-def _width_of(member: dataclasses.Field) -> float:
-    label = GLYPH_WIDTH * len(_label(member))
-    if isinstance(member.metadata["low"], bool):
-        return label + AROUND_SWITCH
+def _width_of(settings: WindowSettings, member: Setting) -> float:
+    label = GLYPH_WIDTH * max(map(len, _labels(settings, member)))
+    if member.choices:
+        longest = max(len(str(choice)) for choice in member.choices) - len(str(value_of(settings, member)))
+        is_switch = isinstance(value_of(settings, member), bool)
+        return label + (0 if is_switch else GLYPH_WIDTH * longest) + AROUND_SWITCH
     return (label + AROUND_LABEL) / LABEL_SHARE
 
 
-def _label(member: dataclasses.Field) -> str:
-    return f"{member.metadata['label']} {member.metadata['unit']}".strip()
+def _labels(settings: WindowSettings, member: Setting) -> list[str]:
+    """Return the text of a control: of each number of a tuple one, of a button with the value."""
+    value = value_of(settings, member)
+    if isinstance(value, tuple):
+        return [str(number) for number in range(1, len(value) + 1)]
+    is_button = member.choices and not isinstance(value, bool)
+    return [f"{member.label}: {value}" if is_button else member.label]

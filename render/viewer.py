@@ -4,120 +4,76 @@ Lengths are in mm, angles in degrees, patient coordinates LPS. Nothing here need
 """
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import numpy as np
+from pydantic import Field
 
-from ultrasound.probe import DetailLevel, DopplerMode, Mode
+from settings import Control, Key, Section
+from ultrasound.probe import Probe, ScannerSettings
 from ultrasound.target import Target
 
 Technique = Literal["enucleation", "enucleoresection", "wedge"]
-TECHNIQUES: tuple[Technique, ...] = get_args(Technique)
 
-B_MODE, TGC, DOPPLER, RESECTION = "B-mode", "TGC", "Doppler", "Resection"
-# Groups of settings beside the image, as on a scanner: TGC or Doppler, and those of a resection, where the
+# Groups of controls beside the image, as on a scanner: TGC or Doppler, and those of a resection, where the
 # user asks for them.
+B_MODE, TGC, DOPPLER, RESECTION = "B-mode", "TGC", "Doppler", "Resection"
 SCANNER_GROUPS = (B_MODE, TGC, DOPPLER, RESECTION)
 
 
-def _slider(default, label: str, unit: str, low, high, group: str):
-    about = {"label": label, "unit": unit, "low": low, "high": high, "group": group}
-    return field(default=default, metadata=about)
-
-
-def _switch(default: bool, label: str, group: str = "View"):
-    return _slider(default, label, "", False, True, group)
-
-
-def _level(number: int):
-    return _slider(50, f"{number}", "", 0, 100, TGC)
-
-
-# The metadata of a setting (label, unit, low, high, group) is all that its slider is made of. One that is
-# None or has no metadata has no slider.
-@dataclass
-class TissueSettings:
-    """Settings of tissue and solver; each tissue model has one of the first two."""
-
-    young_kpa: float | None = _slider(None, "Young", "kPa", 1.0, 100.0, "Tissue")
-    stiffness: float | None = _slider(None, "Stiffness", "", 0.1, 1.0, "Tissue")
-    iterations: int = _slider(9, "Iter.", "", 1, 40, "Tissue")
-    substeps: int = _slider(3, "Substeps", "", 1, 10, "Tissue")
-    gravity_m_s2: float = _slider(9.81, "g", "m/s2", 0.0, 20.0, "Tissue")
-
-
-@dataclass
-class ScannerSettings:
-    """Settings of the ultrasound scanner, and of the CT beside it."""
-
-    depth_mm: int = _slider(60, "Depth", "mm", 5, 300, "Image")
-    window_hu: int = _slider(350, "W", "HU", 1, 2000, "Image")
-    level_hu: int = _slider(40, "L", "HU", -500, 500, "Image")
-    gain_percent: int = _slider(50, "Gain", "%", 0, 100, B_MODE)
-    dyn_range_db: int = _slider(60, "DR", "dB", 20, 120, B_MODE)
-    frequency_mhz: float = _slider(7.5, "", "MHz", 2.0, 15.0, B_MODE)
-    focus_percent: int = _slider(40, "Focus", "%", 0, 100, B_MODE)
-    persistence_percent: int = _slider(0, "Persist", "", 0, 95, B_MODE)
-    compounding: bool = _switch(False, "Spatial compounding", B_MODE)
-    harmonics: bool = _switch(False, "Harmonics", B_MODE)
-    dark_map: bool = _switch(True, "Dark grey map", B_MODE)
-    velocity_scale_cm_s: int = _slider(25, "", "cm/s", 2, 200, DOPPLER)
-    wall_filter_cm_s: float = _slider(1.5, "Filter", "", 0.2, 20.0, DOPPLER)
-    colour_gain_percent: int = _slider(50, "Gain", "%", 0, 100, DOPPLER)
-    colour_steering_deg: int = _slider(0, "Steer", "", -30, 30, DOPPLER)
-    clamped: bool = _switch(False, "Hilum clamped", DOPPLER)
-    tgc_1: int = _level(1)
-    tgc_2: int = _level(2)
-    tgc_3: int = _level(3)
-    tgc_4: int = _level(4)
-    tgc_5: int = _level(5)
-    tgc_6: int = _level(6)
-    tgc_7: int = _level(7)
-    tgc_8: int = _level(8)
-    mode: Mode = "both"
-    detail_level: DetailLevel = "speckle"
-    doppler: DopplerMode = "off"
-
-
-@dataclass
-class ViewSettings:
+class ViewSettings(Section):
     """What the window shows."""
 
-    translucent: bool = _switch(True, "Translucent")
-    cut: bool = _switch(False, "Cut open")
-    show_tumour: bool = _switch(True, "Tumour")
-    show_parts: bool = _switch(True, "Vessels")
-    show_support: bool = _switch(True, "Support")
-    outline: bool = _switch(False, "Outline")
-    show_scanner: bool = False
-    show_seen: bool = False
+    translucent: Annotated[
+        bool, Control("Translucent", "View"), Key("T", "View", "organ translucent or solid")
+    ] = True
+    cut: Annotated[bool, Control("Cut open", "View"), Key("X", "View", "organ cut along the image plane")] = (
+        False
+    )
+    show_tumour: Annotated[bool, Control("Tumour", "View")] = True
+    show_parts: Annotated[bool, Control("Vessels", "View")] = True
+    show_support: Annotated[bool, Control("Support", "View")] = True
+    show_scanner: Annotated[bool, Key("G", "Image", "the scanner's sliders, with TGC")] = False
+    outline: Annotated[
+        bool, Control("Outline", "View"), Key("O", "Image", "outline of the tumour, now and in the CT")
+    ] = False
+    show_seen: Annotated[bool, Key("N", "View", "coverage: imaged tissue in green")] = False
 
 
-@dataclass
-class PlanSettings:
-    """What the next plan is made for."""
+class PlanSettings(Section):
+    """What the next plan is made for, and the margin of plan and cut."""
 
-    margin_mm: int = _slider(5, "Margin", "mm", 0, 20, "Image")
-    plan_for: Target = "margin"
-
-
-@dataclass
-class ResectionSettings:
-    """How the next cut is made; its margin is that of the plan."""
-
-    cut_depth_mm: int = _slider(0, "Cut", "mm", 0, 60, RESECTION)
-    """Below the score; 0: as deep as tumour and margin were seen in the image."""
-    air_in_crater: bool = _switch(False, "Air in crater", RESECTION)
-    show_resection: bool = False
-    technique: Technique = "enucleoresection"
+    margin_mm: Annotated[float, Control("Margin", "Image", is_whole=True)] = Field(5.0, ge=0, le=20)
+    plan_for: Annotated[Target, Key("Space", "Plan", "target: tumour and margin, tumour, kidney")] = "margin"
 
 
-@dataclass
-class Settings(ResectionSettings, PlanSettings, ViewSettings, ScannerSettings, TissueSettings):
-    """What the user sets; each part of the program is handed its own part.
+class ResectionSettings(Section):
+    """How the next cut is made.
 
-    A session records them by their names.
+    ``cut_depth_mm`` is below the score; 0: as deep as tumour and margin were seen in the image.
     """
+
+    technique: Annotated[
+        Technique, Key("Shift+T", "Resection", "technique: enucleoresection, wedge, enucleation")
+    ] = "enucleoresection"
+    show_resection: Annotated[
+        bool, Key("Shift+G", "Resection", "depth of the cut; air or fluid in the crater")
+    ] = False
+    cut_depth_mm: Annotated[float, Control("Cut", RESECTION, is_whole=True)] = Field(0.0, ge=0, le=60)
+    air_in_crater: Annotated[bool, Control("Air in crater", RESECTION)] = False
+
+
+class WindowSettings(Section):
+    """What the user sets, as far as the window itself depends on it; the application has further sections."""
+
+    probe: Probe
+    scanner: ScannerSettings = ScannerSettings()
+    view: ViewSettings = ViewSettings()
+    plan: PlanSettings = PlanSettings()
+    resection: ResectionSettings = ResectionSettings()
+
+
+UserSettings = TypeVar("UserSettings", bound=WindowSettings)
 
 
 # Vertices [mm], a Taichi field (n,) where they move and an array (n, 3) where they do not, and triangles,
@@ -141,8 +97,6 @@ class Geometry:
     """
     transducer_radius_mm: float = 0.0
     """Radius of a curved array face, in the x-z plane; 0 where it is flat."""
-    frequency_range_mhz: tuple[float, float] = (2.0, 15.0)
-    """Range of the probe's frequency."""
     tumour: Surface | None = None
     parts: dict[str, Surface] = field(default_factory=dict)
     """Other structures in the organ, by tissue."""
@@ -256,13 +210,13 @@ class View:
 
 
 @dataclass
-class Controls:
+class Controls(Generic[UserSettings]):
     """The user's input since the last frame; lengths and angles are changes in that time.
 
     Angles are right-handed about the transducer's own axes.
     """
 
-    settings: Settings
+    settings: UserSettings
     ray: tuple[np.ndarray, np.ndarray] | None = None
     """Origin [mm] and unit direction under the mouse, world, each (3,); None off the 3D view or while the
     view turns.

@@ -6,16 +6,15 @@ The only file that uses ti.ui. A frame is drawn in this order:
 2. elsewhere, invisible quads near the camera, over the panel and the strip, which fill the depth buffer
    there, so that no organ covers them;
 3. support, transducer, image plane, tumour, and last the organ, whose faces may be translucent;
-4. the sliders, from the metadata of `Settings`.
+4. the controls of the settings (sliders.py).
 """
 
 import atexit
-import dataclasses
 import time
 from collections import Counter
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic
 
 import numpy as np
 import taichi as ti
@@ -25,11 +24,11 @@ from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
 from render.display import display_available
 from render.gamepad import Gamepad
 from render.graphics_scene import GraphicsScene
-from render.keys import Keys, begin, hold
+from render.keys import Keys, begin, default_keys, hold
 from render.scene_view import SceneView
 from render.sliders import boxes_of, draw_sliders
 from render.software_scene import SoftwareScene
-from render.viewer import SCANNER_GROUPS, Controls, Geometry, Settings, View
+from render.viewer import SCANNER_GROUPS, Controls, Geometry, UserSettings, View
 from render.vulkan_device import draws_by_processor
 from render.window_layout import FULL_SIZE, Rect, WindowLayout
 from sim.device import on_cpu
@@ -49,14 +48,14 @@ class NoVulkan(RuntimeError):
     """Taichi found no Vulkan driver to draw with."""
 
 
-class Window:
+class Window(Generic[UserSettings]):
     """A window on GGUI. The loop is: while running: read_controls, step, draw.
 
     `ti.init` comes before it, and one window is open at a time.
 
     Args:
         geometry: fixed geometry of the scene; without it the window shows progress until `show_scene`.
-        settings: values of the sliders.
+        settings: what the user changes, shown by the sliders.
         size: width, height in pixels.
         visible: a real window, at most FRAMES_A_SECOND; else off-screen, drawn only by `picture`.
         keys: assignment of keys.
@@ -72,7 +71,7 @@ class Window:
     def __init__(
         self,
         geometry: Geometry | None = None,
-        settings: Settings | None = None,
+        settings: UserSettings | None = None,
         size: tuple[int, int] = FULL_SIZE,
         visible=True,
         keys: Keys | None = None,
@@ -81,7 +80,7 @@ class Window:
     ):
         if visible and not display_available():
             raise RuntimeError("no display to open a window on")
-        self.keys, self._gamepad = keys or Keys(), gamepad
+        self.keys, self._gamepad = keys or default_keys(), gamepad
         self.layout = WindowLayout(*size)
         # GGUI measures sliders in fractions of the size that the window was opened with.
         self._first_size = size
@@ -108,17 +107,17 @@ class Window:
         self._slider_boxes: dict[str, Rect] = {}
         self._boxes_moved: Counter[str] = Counter()
         # Groups under a press, where it was, and the settings then.
-        self._before_drag: tuple[list[str], np.ndarray, tuple] | None = None
+        self._before_drag: tuple[list[str], np.ndarray, UserSettings] | None = None
         self._last_read = time.perf_counter()
         self._ui_camera = ti.ui.Camera()
         self._background = BackgroundImage(self.layout, self.keys)
         self._by_processor = draws_by_processor() and on_cpu() if by_processor is None else by_processor
-        if geometry is not None:
+        if geometry is not None and settings is not None:
             self.show_scene(geometry, settings)
 
-    def show_scene(self, geometry: Geometry, settings: Settings | None = None) -> None:
-        """Show a scene from now on, with these values of the sliders."""
-        self.settings, self._geometry = settings or Settings(), geometry
+    def show_scene(self, geometry: Geometry, settings: UserSettings) -> None:
+        """Show a scene from now on, with these settings."""
+        self.settings, self._geometry = settings, geometry
         part, size = (
             self.layout.window_coordinates(self.layout.clear),
             (self.layout.width, self.layout.height),
@@ -161,12 +160,17 @@ class Window:
         """Run no longer, as after the user's key."""
         self._quit = True
 
-    def read_controls(self) -> Controls:
+    def read_controls(self) -> Controls[UserSettings]:
         controls = Controls(settings=self.settings)
+        self._read(controls)
+        self.settings = controls.settings
+        return controls
+
+    def _read(self, controls: Controls) -> None:
         now = time.perf_counter()
         elapsed, self._last_read = min(now - self._last_read, 0.1), now
         if not self._visible:
-            return controls
+            return
         self._read_cursor()
         self._read_events(controls)
         for action in (action for action, key in self.keys.held() if self._window.is_pressed(key)):
@@ -184,7 +188,6 @@ class Window:
         if controls.reset:
             self.camera.go_home()
         self._quit = self._quit or controls.quit
-        return controls
 
     def _read_cursor(self) -> None:
         cursor = np.array(self._window.get_cursor_pos(), dtype=np.float64)
@@ -240,7 +243,7 @@ class Window:
                 controls.pointed_mm = self._background.plane_point_at(*place)
                 boxes = self._slider_boxes.items()
                 pressed = [name for name, box in boxes if box.widened(BOX_EDGE_PX).contains(*place)]
-                self._before_drag = pressed, self._cursor, dataclasses.astuple(self.settings)
+                self._before_drag = pressed, self._cursor, self.settings
         elif key in (ti.ui.RMB, ti.ui.MMB) and self._over_scene():
             pans = key == ti.ui.MMB or with_shift
             self._drag = "pan" if pans else "orbit"
@@ -255,7 +258,7 @@ class Window:
         if before_drag is None or self._cursor is None:
             return
         pressed, cursor, settings = before_drag
-        if np.abs(self._cursor - cursor).max() > DRAG and settings == dataclasses.astuple(self.settings):
+        if np.abs(self._cursor - cursor).max() > DRAG and settings == self.settings:
             self._boxes_moved.update(pressed)
 
     # Drawing
@@ -341,7 +344,7 @@ class Window:
             self._draw_scene(view)
         if not self._help_shown:
             placed = self._slider_boxes, self._first_size, self._boxes_moved
-            draw_sliders(self._gui, self.settings, self._geometry, *placed)
+            self.settings = draw_sliders(self._gui, self.settings, self._geometry, *placed)
 
     def _place_sliders(self) -> None:
         """Have the boxes of the present settings."""
@@ -366,14 +369,14 @@ class Window:
     def _render(self, software: SoftwareScene, view: View, pixels: np.ndarray) -> None:
         """Render the 3D view into pixels as those of the background image."""
         software.look()
-        self._scene_view.draw(software, view, self.settings)
+        self._scene_view.draw(software, view, self.settings.view)
         software.render(self.layout.scene, pixels)
 
     def _keeps_scene(self, may_wait: bool = False) -> bool:
         """Whether the 3D view may stay as it is in this frame: for SCENE_S where frames are slow, or where it
         may wait, unless the user changes the view.
         """
-        now, seen = time.perf_counter(), (*self.camera.state, dataclasses.astuple(self.settings))
+        now, seen = time.perf_counter(), (*self.camera.state, self.settings)
         is_slow, self._frame_at = now - self._frame_at > SLOW_FRAME_S, now
         waits = may_wait or now - self._scene_at < SCENE_S
         keeps = is_slow and waits and seen == self._seen and self._visible
@@ -386,7 +389,7 @@ class Window:
         self._set_camera()
         rects = [self.layout.panel, self.layout.title, self.layout.strip, *self._boxes_over_scene()]
         masked = [self.layout.window_coordinates(rect) for rect in rects]
-        self._scene_view.draw(self._scene, view, self.settings, masked)
+        self._scene_view.draw(self._scene, view, self.settings.view, masked)
         self._canvas.scene(self._scene.ggui_scene)
 
     def _set_camera(self) -> None:

@@ -13,8 +13,9 @@ from errors import explained
 from scenes.atomic_files import atomic_write
 from scenes.patient_space import Space
 from scenes.scene import Scene, SceneError
-from scenes.section import Section, Vector3
+from scenes.section import Vector3
 from scenes.terminal import shell_command
+from settings import Section
 from text_files import TextError, read_text
 
 FINDINGS_FILE = "import.json"

@@ -7,7 +7,8 @@ from typing import Annotated
 
 from pydantic import AfterValidator
 
-from scenes.section import LIST, Section
+from scenes.section import LIST
+from settings import Section
 
 TABLE = Path(__file__).parent / "mechanical_tissues.toml"
 

@@ -13,8 +13,9 @@ import tomli_w
 from pydantic import AliasChoices, Field, ValidationError, model_validator
 
 from errors import UserError, explained, meant
-from scenes.section import LIST, Direction, Length, Section, Vector3
+from scenes.section import LIST, Direction, Length, Vector3
 from scenes.tissue import TISSUES, NeoHookeanTissue, Tissue
+from settings import UNITS, Control, Key, Section, settings_in, settings_of
 from text_files import TextError, read_toml
 from version import FORMAT, of_this_format
 
@@ -24,24 +25,8 @@ EMBEDDED = Path(__file__).parent / "phantom.toml"
 PAPER = Path(__file__).parent / "paper.toml"
 # Rigid shapes, and the probe's, have a bit each of a word of 31.
 MOST_SHAPES = 30
-# Command line options for single values of a scene.
-OPTIONS = {
-    "tissue.model": "--model",
-    "tissue.cell_mm": "--cell",
-    "tissue.young_kpa": "--young-kpa",
-    "tissue.poisson": "--poisson",
-    "tissue.radius_mm": "--radius",
-    "tissue.stiffness": "--stiffness",
-    "solver.substeps": "--substeps",
-    "solver.iterations": "--iterations",
-    "transducer.probe": "--probe",
-    "image.mode": "--picture",
-    "image.detail_level": "--detail-level",
-    "image.atlas": "--atlas",
-}
 
-
-UNIT = re.compile("_(n_mm|kpa_mm|kpa|mm2|mm|m_s2|mm_s|g_cm3|per_mm|per_s|deg|hu|s)$")
+UNIT = re.compile(f"_({'|'.join(UNITS)})$")
 
 
 class SceneError(UserError):
@@ -86,8 +71,14 @@ class SolverSection(Section):
     """
 
     time_step_s: float = Field(1 / 60, gt=0, le=0.1)
-    substeps: int | None = Field(None, ge=1, le=100)
-    iterations: int | None = Field(None, ge=1, le=1000)
+    substeps: Annotated[int | None, "--substeps", Control("Substeps", "Tissue", 1, 10)] = Field(
+        None, ge=1, le=100
+    )
+    """Substeps of a time step."""
+    iterations: Annotated[int | None, "--iterations", Control("Iter.", "Tissue", 1, 40)] = Field(
+        None, ge=1, le=1000
+    )
+    """Iterations of the solver in a substep."""
     stabilisation_iterations: int | None = Field(None, ge=0, le=100)
     relaxation: Literal["local", "global"] = "local"
     relaxation_factor: float | None = Field(None, ge=1, lt=2)
@@ -96,7 +87,7 @@ class SolverSection(Section):
 
 
 class Gravity(Section):
-    acceleration_m_s2: float = Field(9.81, ge=0, le=100)
+    acceleration_m_s2: Annotated[float, Control("g", "Tissue", 0, 20)] = Field(9.81, ge=0, le=100)
     direction: Direction = (0.0, 1.0, 0.0)
 
 
@@ -175,7 +166,8 @@ class Transducer(Section):
     where the tissue under it is compressed by more than ``compression_warning_mm``.
     """
 
-    probe: str = "linear"
+    probe: Annotated[str, "--probe"] = "linear"
+    """Probe, by its name or as a file."""
     size_mm: Annotated[tuple[ProbeLength, ProbeLength, ProbeLength], LIST] | None = None
     speed_mm_s: float = Field(150.0, gt=0, le=2000)
     compression_warning_mm: float = Field(8.0, gt=0, le=100)
@@ -208,19 +200,32 @@ class Image(Section):
     renal fascia, layers in muscle.
     """
 
-    mode: Literal["ct", "b-mode", "both"] = "both"
-    detail_level: Literal["reflection", "speckle", "elevation"] = Field(
-        "speckle", validation_alias=AliasChoices("detail_level", "rung")
-    )
+    mode: Annotated[
+        Literal["both", "b-mode", "ct"],
+        "--picture",
+        Key("B", "Image", "B-mode and CT, B-mode alone, CT alone"),
+    ] = "both"
+    """B-mode, CT or both."""
+    detail_level: Annotated[
+        Literal["reflection", "speckle", "elevation"],
+        "--detail-level",
+        Key("V", "Image", "detail level of the B-mode image"),
+    ] = Field("speckle", validation_alias=AliasChoices("detail_level", "rung"))
+    """Detail level (realism) of the B-mode image."""
     depth_mm: float | None = Field(None, ge=5, le=300)
     pixels: int = Field(512, ge=16, le=4096)
-    window_hu: float = Field(350.0, gt=0, le=10000)
-    level_hu: float = Field(40.0, ge=-2000, le=4000)
+    window_hu: Annotated[float, Control("W", "Image", 1, 2000, is_whole=True)] = Field(350.0, gt=0, le=10000)
+    level_hu: Annotated[float, Control("L", "Image", -500, 500, is_whole=True)] = Field(
+        40.0, ge=-2000, le=4000
+    )
     outside: Literal["background", "gel", "air", "fluid"] = "background"
     contact: Literal["organ", "tissue"] = "organ"
     contact_gap_mm: float = Field(1.5, ge=0, le=20)
     fluid_gap_mm: float = Field(4.0, ge=0, le=5)
-    atlas: bool = True
+    atlas: Annotated[bool, "--atlas/--no-atlas"] = True
+    """Draw from an atlas what the CT cannot show: pyramids without enhancement, the renal fascia, layers in
+    muscle.
+    """
 
     @model_validator(mode="after")
     def _fluid_is_on_the_organ(self) -> "Image":
@@ -309,6 +314,15 @@ class Scene(Section):
             if wanted and self.tissue.model not in able:
                 raise ValueError(refusal.format(f"set tissue.model to {' or '.join(able)}"))
         return self
+
+
+# The settings of a scene, of each tissue model, and what options of the command line change of them: path ->
+# option.
+SETTINGS = (
+    *(setting for model in TISSUES.values() for setting in settings_of("tissue", model)),
+    *(setting for setting in settings_in(Scene) if not setting.path.startswith("tissue.")),
+)
+OPTIONS = {setting.path: setting.option for setting in SETTINGS if setting.option is not None}
 
 
 # Files that are given by mistake instead of a scene, by the end of their names, and the commands that read

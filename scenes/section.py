@@ -1,9 +1,9 @@
-"""What every section of a scene file is, and the kinds of value that several have."""
+"""Kinds of value that several sections of a scene file have."""
 
 from typing import Annotated
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, Field
 
 # TOML and JSON have lists where Python has tuples.
 LIST = Field(strict=False)
@@ -18,9 +18,3 @@ def _not_zero(vector: Vector3) -> Vector3:
 
 
 Direction = Annotated[Vector3, AfterValidator(_not_zero)]
-
-
-class Section(BaseModel):
-    """Its keys are all that there are, and its values do not change. A text is no number."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)

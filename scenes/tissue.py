@@ -5,9 +5,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, SerializeAsAny
 
-from scenes.section import LIST, Section
+from scenes.section import LIST
+from settings import Control, Section
 
-Stiffness = Annotated[float, Field(ge=0, le=1)]
 QUALITIES = ("fast", "balanced", "accurate")
 # The parts of an organ that can have their own material; where two overlap, the later one counts.
 PartName = Literal["sinus", "vessel", "urine", "cyst", "tumour"]
@@ -33,7 +33,8 @@ class TissueSection(Section):
     supports_self_contact: ClassVar[bool] = False
     supports_attachment: ClassVar[bool] = False
 
-    model: str
+    model: Annotated[str, "--model"]
+    """Tissue model."""
 
     def __hash__(self) -> int:
         # Lists and tables among the values have no hash of their own.
@@ -81,10 +82,14 @@ class NeoHookeanTissue(TissueSection):
     presets: ClassVar = dict(fast=dict(cell_mm=5.0), balanced={}, accurate=dict(cell_mm=2.0, iterations=12))
     supports_attachment = True
 
-    model: Literal["neo-hookean"] = "neo-hookean"
-    cell_mm: float = Field(3.5, ge=0.5, le=20)
-    young_kpa: float = Field(15.0, gt=0, le=1e6)
-    poisson: float = Field(0.45, ge=0, le=0.4999)
+    model: Annotated[Literal["neo-hookean"], "--model"] = "neo-hookean"
+    """Tissue model."""
+    cell_mm: Annotated[float, "--cell"] = Field(3.5, ge=0.5, le=20)
+    """Width of a cell in mm."""
+    young_kpa: Annotated[float, "--young-kpa", Control("Young", "Tissue", 1, 100)] = Field(15.0, gt=0, le=1e6)
+    """Young's modulus in kPa."""
+    poisson: Annotated[float, "--poisson"] = Field(0.45, ge=0, le=0.4999)
+    """Poisson's ratio."""
     density_g_cm3: float = Field(1.05, gt=0, le=20)
     parts: dict[PartName, PartMaterial] = Field(default_factory=dict)
     capsule_n_mm: float = Field(0.0, ge=0, le=100)
@@ -111,9 +116,12 @@ class ShapeMatchingTissue(TissueSection):
     presets: ClassVar = dict(fast=dict(radius_mm=3.3), balanced={}, accurate=dict(radius_mm=2.2))
     supports_self_contact = True
 
-    model: Literal["shape-matching"]
-    radius_mm: float = Field(2.7, ge=0.5, le=20)
-    stiffness: Stiffness = 0.95
+    model: Annotated[Literal["shape-matching"], "--model"]
+    """Tissue model."""
+    radius_mm: Annotated[float, "--radius"] = Field(2.7, ge=0.5, le=20)
+    """Particle radius in mm."""
+    stiffness: Annotated[float, "--stiffness", Control("Stiffness", "Tissue", 0.1)] = Field(0.95, ge=0, le=1)
+    """Cluster stiffness, 0 to 1."""
     density_g_cm3: float = Field(1.05, gt=0, le=20)
     volume_sampling: float = Field(4.0, ge=1, le=8)
     cluster_spacing: float = Field(3.33, ge=1, le=20)

@@ -9,11 +9,14 @@ import numpy as np
 
 from rehearsal.loop.timeline import Timeline
 from rehearsal.pressed_organ import OrganState
+from scenes.scene import AnatomyFiles, Gravity, Scene, SolverSection
+from scenes.tissue import TissueSection
 from sim.body import BodyState
 from sim.divergence_check import DivergenceState
 from sim.solver import SolverState, StepSettings
 
 STEP_S = 0.125
+PHANTOM = Scene(anatomy=AnatomyFiles(phantom=True), solver=SolverSection(iterations=4))
 
 
 class FakeOrgan:
@@ -22,7 +25,7 @@ class FakeOrgan:
     """
 
     def __init__(self) -> None:
-        self.case = SimpleNamespace(organ=None, tumour=None, parts={})
+        self.case = SimpleNamespace(organ=None, tumour=None, parts={}, scene=PHANTOM)
         self.settings = StepSettings(time_step_s=STEP_S, iterations=4)
         self.young_kpa, self.gravity = 15.0, 9.81
         self.position, self.velocity = np.zeros((2, 3), np.float32), np.ones((2, 3), np.float32)
@@ -68,11 +71,9 @@ class FakeOrgan:
         arrays = self.position, self.velocity
         return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()[:16]
 
-    def set_young(self, young_kpa: float) -> None:
-        self.young_kpa = young_kpa
-
-    def set_gravity(self, gravity: float) -> None:
-        self.gravity = gravity
+    def set(self, tissue: TissueSection, section: SolverSection, gravity: Gravity) -> None:
+        self.young_kpa, self.gravity = tissue.young_kpa, gravity.acceleration_m_s2
+        self.settings.iterations = section.iterations
 
     def check_can_be_cut(self) -> None: ...
     def apply_cut(self, cut) -> None: ...

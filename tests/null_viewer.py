@@ -1,15 +1,17 @@
 """A window that draws nothing."""
 
 import numpy as np
+from settings_at_start import settings_with
 
-from render.viewer import Controls, Geometry, Settings, View
+from rehearsal.live_settings import LiveSettings
+from render.viewer import Controls, Geometry, View
 
 
 class NullViewer:
     """What a ``WindowLoop`` asks of a window; ``script`` has controls frame by frame, until one quits."""
 
-    def __init__(self, settings: Settings | None = None, script=(), size: tuple[int, int] = (1280, 720)):
-        self.settings = settings or Settings()
+    def __init__(self, settings: LiveSettings | None = None, script=(), size: tuple[int, int] = (1280, 720)):
+        self.settings = settings or settings_with()
         self.frames = 0
         self._script = iter(script)
         self._size = size
@@ -20,7 +22,9 @@ class NullViewer:
         return self._running
 
     def read_controls(self) -> Controls:
-        controls = next(self._script, None) or Controls(settings=self.settings)
+        controls = next(self._script, None) or Controls(None)
+        # Those that the window has, where the script does not set others.
+        self.settings = controls.settings = controls.settings or self.settings
         self._running = self._running and not controls.quit
         return controls
 

@@ -61,7 +61,7 @@ class LiveSession:
 def record_all(path: Path, steps: int = 40, **given) -> str:
     """A session with each kind of command; the tissue's digest at its end."""
     live = LiveSession(path, **given)
-    live.do(SetValues(values={"young_kpa": 20.0, "depth_mm": 50}))
+    live.do(SetValues(values={"tissue.young_kpa": 20.0, "probe.depth_mm": 50.0}))
     live.move(steps // 4)
     live.do(BeginAction(), Bookmark())
     live.move(steps // 4)

@@ -6,13 +6,15 @@ from typing import Any
 import numpy as np
 import trimesh
 from fake_organ import fake_timeline
+from settings_at_start import settings_with
 
+from rehearsal.live_settings import LiveSettings
 from rehearsal.loop.command import Command, NewSession, SetValues
 from rehearsal.loop.frame import Frame
 from rehearsal.notices import Notices
 from rehearsal.sources.tracker import Tracker
 from rehearsal.sources.user import UserSource
-from render.viewer import Controls, Settings
+from render.viewer import Controls
 from ultrasound.probe_manipulator import (
     ImagePlane,
     ProbeManipulator,
@@ -22,6 +24,7 @@ from ultrasound.probe_manipulator import (
 )
 
 SIZE = np.array([6.0, 4.0, 6.0])
+START = settings_with()
 ORIGIN = np.array([40.0, -7.0, 300.0])
 DOWN = np.array([0.0, 0.0, -1.0])
 
@@ -63,9 +66,9 @@ class UserAtBall:
         self.frame = self.stepper.newest()
         self.commands: list[Command] = []
 
-    def step(self, settings: Settings | None = None, **did: Any) -> np.ndarray:
+    def step(self, settings: LiveSettings | None = None, **did: Any) -> np.ndarray:
         """A frame in which the user did something; the transducer's pose after it."""
-        controls = Controls(settings or Settings(young_kpa=15.0), **did)
+        controls = Controls(settings or START, **did)
         self.commands = list(
             self.source.commands(self.frame, controls, self.timeline.organ.settings.time_step_s)
         )

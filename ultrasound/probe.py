@@ -7,13 +7,14 @@ centre of the array face.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 from pydantic.alias_generators import to_pascal
 
 from errors import UserError, explained, meant
+from settings import Control, Key, Section
 from text_files import TextError, read_toml
 from ultrasound.pulse import DB_OF_NEPER, PATH_STEP, SOUND_MM_US, AttenuatedPulse, attenuated_pulse
 
@@ -21,14 +22,11 @@ PROBES = Path(__file__).parent / "probes"
 GAIN_RANGE_DB, TGC_RANGE_DB, TGC_SLIDERS = 60.0, 24.0, 8
 
 Mode = Literal["both", "b-mode", "ct"]
-MODES: tuple[Mode, ...] = get_args(Mode)
 # Realism of the B-mode image: reflection and attenuation; also speckle and point spread; also the slice
 # thickness.
 DetailLevel = Literal["reflection", "speckle", "elevation"]
-DETAIL_LEVELS: tuple[DetailLevel, ...] = get_args(DetailLevel)
 
 DopplerMode = Literal["off", "colour", "power"]
-DOPPLER_MODES: tuple[DopplerMode, ...] = get_args(DopplerMode)
 
 # Grey values: the exponent of the share of the dynamic range. On a scanner's screen most of the tissue is
 # dark.
@@ -57,7 +55,7 @@ class ProbeError(UserError):
     """A probe file that cannot be used; the message is one line."""
 
 
-class Probe(BaseModel):
+class Probe(Section):
     """One probe with the scanner's settings, as its file has them in PLUS's spelling (``frequency_mhz`` is
     FrequencyMhz).
 
@@ -77,14 +75,7 @@ class Probe(BaseModel):
     the sliders of ``time_gain_compensation`` [%] add.
     """
 
-    model_config = ConfigDict(
-        extra="forbid",
-        frozen=True,
-        allow_inf_nan=False,
-        strict=True,
-        alias_generator=to_pascal,
-        populate_by_name=True,
-    )
+    model_config = ConfigDict(alias_generator=to_pascal, populate_by_name=True)
 
     transducer_name: str = Field(min_length=1, max_length=60)
     transducer_geometry: Literal["LINEAR", "CURVILINEAR", "PHASED"] = "LINEAR"
@@ -97,9 +88,11 @@ class Probe(BaseModel):
     number_of_scanlines: int = Field(192, ge=32, le=1024)
     number_of_samples_per_scanline: int = Field(640, ge=32, le=4096, multiple_of=16)
     frequency_range_mhz: Range = (2.0, 15.0)
-    frequency_mhz: float = Field(7.5, ge=1, le=40)
-    depth_mm: float = Field(60.0, ge=5, le=300)
-    focus_depth_percent: Percent = 40.0
+    frequency_mhz: Annotated[float, Control("", "B-mode", limits="frequency_range_mhz")] = Field(
+        7.5, ge=1, le=40
+    )
+    depth_mm: Annotated[float, Control("Depth", "Image", is_whole=True)] = Field(60.0, ge=5, le=300)
+    focus_depth_percent: Annotated[Percent, Control("Focus", "B-mode", is_whole=True)] = 40.0
     number_of_elements: int = Field(128, ge=8, le=4096)
     f_number: float = Field(2.5, ge=0.5, le=20)
     element_height_mm: float = Field(5.0, gt=0, le=40)
@@ -108,17 +101,21 @@ class Probe(BaseModel):
     bandwidth_percent: float = Field(75.0, ge=20, le=150)
     noise_db: float = Field(-102.0, ge=-200, le=0)
     ringing_db: float = Field(-36.0, ge=-200, le=0)
-    gain_percent: Percent = 68.0
-    dyn_range_db: float = Field(60.0, ge=20, le=120)
-    grey_map: GreyMap = "dark"
+    gain_percent: Annotated[Percent, Control("Gain", "B-mode", is_whole=True)] = 68.0
+    dyn_range_db: Annotated[float, Control("DR", "B-mode", is_whole=True)] = Field(60.0, ge=20, le=120)
+    grey_map: Annotated[GreyMap, Control("Grey map", "B-mode")] = "dark"
     steering_deg: float = Field(0.0, ge=-30, le=30)
-    compound_angles: Literal[1, 3, 5] = 1
-    harmonics: bool = False
-    velocity_scale_cm_s: float = Field(25.0, ge=2, le=200)
-    wall_filter_cm_s: float = Field(1.5, ge=0.2, le=20)
-    colour_gain_percent: Percent = 50.0
-    colour_steering_deg: float = Field(0.0, ge=-30, le=30)
-    time_gain_compensation: Sliders = (50.0,) * TGC_SLIDERS
+    compound_angles: Annotated[Literal[1, 3, 5], Control("Compounding", "B-mode")] = 1
+    harmonics: Annotated[bool, Control("Harmonics", "B-mode")] = False
+    velocity_scale_cm_s: Annotated[float, Control("", "Doppler", is_whole=True)] = Field(25.0, ge=2, le=200)
+    wall_filter_cm_s: Annotated[float, Control("WF", "Doppler")] = Field(1.5, ge=0.2, le=20)
+    colour_gain_percent: Annotated[Percent, Control("Gain", "Doppler", is_whole=True)] = 50.0
+    colour_steering_deg: Annotated[float, Control("Steer", "Doppler", is_whole=True)] = Field(
+        0.0, ge=-30, le=30
+    )
+    time_gain_compensation: Annotated[Sliders, Control("", "TGC", 0, 100, is_whole=True)] = (
+        50.0,
+    ) * TGC_SLIDERS
     depth_compensation_db_cm_mhz: float = Field(0.7, ge=0, le=5)
 
     @model_validator(mode="after")
@@ -154,6 +151,15 @@ class Probe(BaseModel):
                 f"the array is {array:.1f} mm wide, HousingMm {self.housing_mm[0]:g}: it must fit in"
             )
         return self
+
+    @property
+    def fixed(self) -> frozenset[str]:
+        """As ``Section.fixed``: the steering that its geometry excludes."""
+        return {
+            "LINEAR": frozenset[str](),
+            "CURVILINEAR": frozenset({"colour_steering_deg"}),
+            "PHASED": frozenset({"colour_steering_deg", "compound_angles"}),
+        }[self.transducer_geometry]
 
     @property
     def wavelength_mm(self) -> float:
@@ -312,6 +318,14 @@ class Probe(BaseModel):
         places = (np.arange(TGC_SLIDERS) + 0.5) * self.depth_mm / TGC_SLIDERS
         sliders = np.interp(depth, places, self.time_gain_compensation)
         return own + (self.gain_percent - 50) / 100 * GAIN_RANGE_DB + (sliders - 50) / 100 * TGC_RANGE_DB
+
+
+class ScannerSettings(Section):
+    """Settings of the scanner that are no part of a probe's file."""
+
+    persistence_percent: Annotated[int, Control("Pers.", "B-mode")] = Field(0, ge=0, le=95)
+    doppler: Annotated[DopplerMode, Key("Tab", "Image", "Doppler: colour, power, off")] = "off"
+    clamped: Annotated[bool, Control("Hilum clamped", "Doppler")] = False
 
 
 def load_probe(name: str) -> Probe:

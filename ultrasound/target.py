@@ -2,7 +2,6 @@
 organ.
 """
 
-from typing import Literal, get_args
+from typing import Literal
 
 Target = Literal["margin", "tumour", "organ"]
-TARGETS: tuple[Target, ...] = get_args(Target)

@@ -7,7 +7,7 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType, UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin
 
 import click
 from pydantic import BaseModel, ConfigDict
@@ -17,9 +17,8 @@ from rehearsal.configuration import with_quality
 from rehearsal.result_files import write_json
 from scenes.atomic_files import check_writable
 from scenes.import_findings import open_warnings, warning_lines
-from scenes.scene import OPTIONS, Scene, load_scene, scene_file, with_options
-from scenes.tissue import QUALITIES
-from ultrasound.probe import DetailLevel, Mode
+from scenes.scene import OPTIONS, SETTINGS, Scene, load_scene, scene_file, with_options
+from scenes.tissue import QUALITIES, TISSUES
 
 if TYPE_CHECKING:
     from scenes.anatomy import LoadedAnatomy
@@ -159,11 +158,6 @@ arch_option = click.option(
 )
 
 
-def field_of(option: str) -> str:
-    """The field of ``CommandOptions`` for an option without a name of its own."""
-    return option.strip("-").replace("-", "_")
-
-
 def _option(field: str) -> str:
     return f"--{field.replace('_', '-')}"
 
@@ -178,18 +172,23 @@ class CommandOptions(BaseModel):
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
-    @property
-    def changes(self) -> dict[str, Any]:
-        """The values of a scene that the options change, by key; None for an option that was not given."""
-        fields = {key: field_of(option) for key, option in OPTIONS.items()}
-        return {
-            key: getattr(self, field) for key, field in fields.items() if field in type(self).model_fields
-        }
+    scene_sections: ClassVar[tuple[str, ...]] = ()
+    """Sections of a scene whose settings with an option are options of the command too."""
 
-    def given(self, *fields: str) -> list[str]:
-        """Those options among some fields that differ from their defaults, as the user names them."""
-        named = type(self).model_fields
-        return [_option(field) for field in fields if getattr(self, field) != named[field].default]
+    changes: dict[str, Any] = {}
+    """The values of a scene that options change, by path."""
+
+    def given(self, *names: str) -> list[str]:
+        """Those options among some fields and settings of a scene that the user gave, as the user names
+        them.
+        """
+        fields = type(self).model_fields
+        options = {name: OPTIONS[name].split("/")[0] for name in names if name in self.changes}
+        return [
+            options.get(name) or _option(name)
+            for name in names
+            if name in options or (name in fields and getattr(self, name) != fields[name].default)
+        ]
 
 
 Given = TypeVar("Given", bound=CommandOptions)
@@ -199,13 +198,18 @@ def command(
     options: type[Given], name: str | None = None
 ) -> Callable[[Callable[[Given], None]], click.Command]:
     """Make a function of some options a command; its help lists own options before inherited ones."""
-    fields = options.model_fields
+    fields = {name: field for name, field in options.model_fields.items() if name != "changes"}
     own_first = sorted(fields, key=lambda field: field not in options.__annotations__)
-    parameters = [_parameter(field, fields[field]) for field in own_first]
+    of_scene = {
+        path.replace(".", "_"): path for path in OPTIONS if path.split(".")[0] in options.scene_sections
+    }
+    parameters: list[click.Parameter] = [_parameter(field, fields[field]) for field in own_first]
+    parameters += [_scene_option(name, path) for name, path in of_scene.items()]
 
     def made(run: Callable[[Given], None]) -> click.Command:
-        def called(**given: Any) -> None:
-            run(options(**given))
+        def called(**values: Any) -> None:
+            changes = {path: values.pop(name) for name, path in of_scene.items()}
+            run(options(**values, changes={path: of for path, of in changes.items() if of is not None}))
 
         return click.Command(
             name or run.__name__, callback=called, params=parameters, help=inspect.getdoc(run)
@@ -214,9 +218,27 @@ def command(
     return made
 
 
-def _parameter(name: str, field: FieldInfo) -> click.Parameter:
+def _scene_option(name: str, path: str) -> click.Option:
+    """The option of a setting of a scene; where only one tissue model has it, the help names that."""
+    settings = [setting for setting in SETTINGS if setting.path == path]
+    models = [name for name, section in TISSUES.items() if settings[0].name in section.model_fields]
+    of_model = f" ({models[0]})" if path.startswith("tissue.") and len(models) == 1 else ""
+    help = f"{str(settings[0].field.description).removesuffix('.')}{of_model} [the scene's]."
+    choices = [choice for setting in settings for choice in setting.choices]
+    if choices == [False, True]:
+        return click.Option([OPTIONS[path], name], default=None, help=help)
+    kind = click.Choice(choices) if choices else _click_type(_kind_of(settings[0].field), [])
+    return click.Option([OPTIONS[path], name], type=kind, help=help)
+
+
+def _kind_of(field: FieldInfo) -> Any:
+    """The type of a field, without None."""
     is_union = get_origin(field.annotation) in (Union, UnionType)
-    kind = get_args(field.annotation)[0] if is_union else field.annotation
+    return get_args(field.annotation)[0] if is_union else field.annotation
+
+
+def _parameter(name: str, field: FieldInfo) -> click.Parameter:
+    kind = _kind_of(field)
     items = get_args(kind) if get_origin(kind) is tuple else (kind,)
     marks = [each for each in field.metadata if isinstance(each, str)]
     common: dict[str, Any] = dict(
@@ -253,21 +275,6 @@ class ArchOptions(CommandOptions):
 
     arch: Literal["auto", "cuda", "vulkan", "cpu"] = "auto"
     """Where to compute; auto is CUDA where there is one, else the CPU."""
-
-
-class ImageOptions(CommandOptions):
-    """Values of a scene's image."""
-
-    probe: str | None = None
-    """Probe, by its name or as a file [the scene's]."""
-    picture: Mode | None = None
-    """B-mode, CT or both [the scene's]."""
-    detail_level: Annotated[DetailLevel | None, "--detail-level"] = None
-    """Detail level (realism) of the B-mode image [the scene's]."""
-    atlas: Annotated[bool | None, "--atlas/--no-atlas"] = None
-    """Draw from an atlas what the CT cannot show: pyramids without enhancement, the renal fascia, layers
-    in muscle [the scene's].
-    """
 
 
 class QualityOptions(CommandOptions):

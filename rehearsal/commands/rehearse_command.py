@@ -6,6 +6,7 @@ import click
 
 from rehearsal.commands.command_line import CommandError, command
 from rehearsal.commands.rehearse_options import RehearseOptions
+from rehearsal.live_settings import DEFAULT_KEYS
 from rehearsal.real_time.started_process import started_process
 from render.display import display_available
 from render.keys import keys_text
@@ -37,7 +38,7 @@ def rehearse(asked: RehearseOptions) -> None:
 @click.command("keys")
 def keys_command() -> None:
     """Print the keys as a file to change, for rehearse --keys."""
-    click.echo(keys_text(), nl=False)
+    click.echo(keys_text(DEFAULT_KEYS), nl=False)
 
 
 def why_no_display() -> str:

@@ -1,28 +1,24 @@
 """The options of ``rehearse``, and which of them exclude each other."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
-import click
 from pydantic import Field
 
 from rehearsal.commands.command_line import (
     ARGUMENT,
     ArchOptions,
     CommandError,
-    ImageOptions,
     QualityOptions,
-    field_of,
 )
 from rehearsal.tracking.openigtlink_options import LinkOptions
 from scenes.scene import EMBEDDED, OPTIONS
-from scenes.tissue import TISSUES
 
-# Options that choose resolution and iterations, and the options of tissue and solver that each leaves to the
+# Options that choose resolution and iterations, and the settings of tissue and solver that each leaves to the
 # user.
-MATERIAL = ("model", "young_kpa", "poisson")
-LEFT = {"quality": (*MATERIAL, "stiffness"), "budget_ms": MATERIAL, "error_mm": MATERIAL}
-TISSUE_AND_STEP = [field_of(name) for key, name in OPTIONS.items() if key.startswith(("tissue.", "solver."))]
+MATERIAL = ("tissue.model", "tissue.young_kpa", "tissue.poisson")
+LEFT = {"quality": (*MATERIAL, "tissue.stiffness"), "budget_ms": MATERIAL, "error_mm": MATERIAL}
+TISSUE_AND_STEP = [path for path in OPTIONS if path.startswith(("tissue.", "solver."))]
 # Options that exclude each other, and options that need another one.
 EXCLUDING = {
     ("track", "replay"): "--track: a replay has the recorded poses; leave out --track or --replay",
@@ -54,8 +50,10 @@ NEEDING = {
 }
 
 
-class RehearseOptions(LinkOptions, ImageOptions, QualityOptions, ArchOptions):
+class RehearseOptions(LinkOptions, QualityOptions, ArchOptions):
     """What the user asks of a rehearsal."""
+
+    scene_sections: ClassVar = ("tissue", "solver", "transducer", "image")
 
     scene: Annotated[Path, ARGUMENT] = EMBEDDED
     headless: bool = False
@@ -88,22 +86,6 @@ class RehearseOptions(LinkOptions, ImageOptions, QualityOptions, ArchOptions):
     """A sweep to follow, or a resection to compare with: a file of app.py plan."""
     out: Path = Path("out")
     """Folder for images and report; a run without a window replaces those of an earlier one."""
-    model: Annotated[str | None, click.Choice(list(TISSUES))] = None
-    """Tissue model [the scene's]."""
-    cell: float | None = None
-    """neo-hookean: width of a cell in mm [the scene's]."""
-    young_kpa: float | None = None
-    """neo-hookean: Young's modulus in kPa [the scene's]."""
-    poisson: float | None = None
-    """neo-hookean: Poisson's ratio [the scene's]."""
-    radius: float | None = None
-    """shape-matching: particle radius in mm [the scene's]."""
-    stiffness: float | None = None
-    """shape-matching: cluster stiffness, 0 to 1 [the scene's]."""
-    substeps: int | None = None
-    """Substeps of a time step [the model's]."""
-    iterations: int | None = None
-    """Iterations of the solver in a substep [the model's]."""
     budget_ms: float | None = Field(None, ge=0.01, le=10_000)
     """Choose the most accurate resolution and iterations whose step takes no longer on this machine
     (measured first).
@@ -126,7 +108,7 @@ class RehearseOptions(LinkOptions, ImageOptions, QualityOptions, ArchOptions):
                 if self.given(first) and len(self.given(first, second)) == wrong:
                     raise CommandError(text)
         choosers = [field for field in LEFT if self.given(field)]
-        for option in self.given(*choosers, *map(field_of, OPTIONS.values())) if self.replay else ():
+        for option in self.given(*choosers, *OPTIONS) if self.replay else ():
             raise CommandError(f"{option}: a replay computes what was recorded; leave it out")
         for chooser in choosers[:1]:
             for option in self.given(*(field for field in TISSUE_AND_STEP if field not in LEFT[chooser])):

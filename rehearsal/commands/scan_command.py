@@ -2,7 +2,7 @@
 
 from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import click
 import numpy as np
@@ -13,7 +13,6 @@ from rehearsal.commands.command_line import (
     ARGUMENT,
     ArchOptions,
     CommandError,
-    ImageOptions,
     command,
     load_patient,
     make_folder,
@@ -30,8 +29,10 @@ from version import VERSION
 DEEP_MM = 20.0
 
 
-class ScanOptions(ImageOptions, ArchOptions):
+class ScanOptions(ArchOptions):
     """What the user asks of a scan."""
+
+    scene_sections: ClassVar = ("transducer", "image")
 
     scene: Annotated[Path, ARGUMENT]
     poses: Annotated[Path, "--pose"]

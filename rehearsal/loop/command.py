@@ -14,6 +14,7 @@ from rehearsal.loop.history import History
 from rehearsal.loop.state import WholeState
 from rehearsal.resection.resection_state import MOST_MARKS
 from render.viewer import Technique
+from settings import Value
 from ultrasound.crater import Filling
 from ultrasound.probe_manipulator import ManipulatorState
 
@@ -88,12 +89,12 @@ class Pause(_Command):
 
 
 class SetValues(_Command):
-    """Settings by name: those of tissue and step change the steps from now on, all others only what is
-    shown.
+    """Settings by path: those of tissue, solver and gravity change the steps from now on, all others only
+    what is shown.
     """
 
     kind: Literal["set"] = "set"
-    values: dict[str, bool | int | float | str | None]
+    values: dict[str, Value]
 
 
 class BeginAction(_Command):

@@ -9,6 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
+from rehearsal.live_settings import LiveSettings
 from rehearsal.loop.command import Command
 from rehearsal.loop.frame import Frame
 from render.viewer import Controls
@@ -23,7 +24,7 @@ class Source(Protocol):
         """A line for the panel; empty if there is none."""
         ...
 
-    def commands(self, frame: Frame, controls: Controls, elapsed_s: float) -> Iterable[Command]:
+    def commands(self, frame: Frame, controls: Controls[LiveSettings], elapsed_s: float) -> Iterable[Command]:
         """The commands after a frame, with the user's controls, a time [s] after the last ones."""
         ...
 

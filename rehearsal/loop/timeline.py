@@ -6,7 +6,6 @@ It is deterministic: the same commands give the same states, events and bits, wh
 
 import base64
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -47,6 +46,7 @@ from rehearsal.pressed_organ import PressedOrgan
 from rehearsal.resection.cut import Cut, CutSettings, check_hilum, cut_organ, hilum_of, part_left
 from rehearsal.resection.resection_state import NO_RESECTION, CutRequest, Resection
 from rehearsal.resection.score_line import ResectionError, score_line
+from settings import Value, with_values
 from sim.fields import array_of
 from sim.skinning import ClusterCarrier
 from ultrasound.probe_manipulator import ManipulatorState
@@ -55,6 +55,8 @@ from ultrasound.probe_manipulator import ManipulatorState
 SETTLED = -1
 # Simulated time between two digests, and between two whole states for a session's file.
 DIGEST_S, CHECKPOINT_S = 1.0, 60.0
+# The sections of settings that steps depend on.
+STEPPED = "tissue", "solver", "gravity"
 # Geometries of this many cuts are kept, for undo and redo.
 KEPT_CUTS = 4
 
@@ -80,6 +82,8 @@ class Timeline:
         self._digested = SETTLED
         self._events: list[Event] = []
         self._noted_iterations = organ.settings.iterations
+        # With the settings of tissue, solver and gravity that were made since the start.
+        self._scene = organ.case.scene
 
     def submit(self, command: Command) -> None:
         """Apply a command at once. ``Follow`` is a step of the length that is set."""
@@ -120,7 +124,7 @@ class Timeline:
         length_s, iterations = length_s or settings.time_step_s, iterations or settings.iterations
         if iterations != self._noted_iterations:
             self._noted_iterations = iterations
-            self._events.append(Applied(self.number, SetValues(values={"iterations": iterations})))
+            self._events.append(Applied(self.number, SetValues(values={"solver.iterations": iterations})))
         took_ms, wrench = self.organ.timed_step(pose, length_s, iterations)
         of_step = length_s, iterations, took_ms, wrench, self.organ.notice, input_s, late_ms, awaited
         step = Step(self.number, pose, *of_step)
@@ -197,17 +201,12 @@ class Timeline:
                 return self._restore(self.history.begun(self.number), number, "There is no such bookmark")
         return None
 
-    def _set(self, values: dict[str, Any]) -> None:
-        """Set what steps depend on; other settings are only recorded."""
-        step = self.organ.settings
-        for name in ("iterations", "substeps", "stiffness"):
-            if values.get(name) is not None:
-                setattr(step, name, values[name])
-        self._noted_iterations = step.iterations
-        if values.get("young_kpa") not in (None, self.organ.young_kpa):
-            self.organ.set_young(values["young_kpa"])
-        if values.get("gravity_m_s2") is not None:
-            self.organ.set_gravity(values["gravity_m_s2"])
+    def _set(self, values: dict[str, Value]) -> None:
+        """Set what steps depend on; other settings are only recorded. Raises SettingError."""
+        of_step = {path: value for path, value in values.items() if path.split(".")[0] in STEPPED}
+        self._scene = with_values(self._scene, of_step)
+        self.organ.set(self._scene.tissue, self._scene.solver, self._scene.gravity)
+        self._noted_iterations = self.organ.settings.iterations
 
     def _begin(self, manipulator: ManipulatorState | None = None) -> None:
         """An action begins here."""

@@ -17,7 +17,7 @@ from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.resection.judgement import findings_of
 from rehearsal.sessions.packed_arrays import unpack_seen
 from rehearsal.sessions.session_file import Log, SessionError, makes_state
-from render.viewer import Settings, View
+from render.viewer import View, ViewSettings
 from ultrasound.coverage import GRID_POINTS, Coverage, Gap
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import ProbeManipulator
@@ -198,7 +198,7 @@ class LiveMeasurements:
         limit = self.anatomy.case.scene.transducer.compression_warning_mm
         return self.latest is not None and self.latest.compression_mm > limit
 
-    def onto(self, view: View, settings: Settings) -> View:
+    def onto(self, view: View, shown: ViewSettings) -> View:
         """A view with the measurements."""
         status = view.status
         if self.is_over_limit and self.latest is not None and not status:
@@ -207,7 +207,7 @@ class LiveMeasurements:
             view,
             findings=self._findings,
             alert=COMPRESSION if self.is_over_limit else "",
-            seen=self._shown_coverage() if settings.show_seen else {},
+            seen=self._shown_coverage() if shown.show_seen else {},
             guidance=self.guide.guidance() if self.guide is not None else None,
             status=status,
             notes={B_MODE: "NO CONTACT"} if self._touches.mean() < LEAST_CONTACT else {},

@@ -9,6 +9,7 @@ from time import perf_counter
 from joblib import cpu_count
 
 from rehearsal.case import Case
+from rehearsal.live_settings import LiveSettings
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.notices import Notices
 from rehearsal.planning.plan_file import Plan, PlanError, next_plan_path, write_plan
@@ -16,11 +17,9 @@ from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plan_search import make_plan, total_work
 from rehearsal.planning.sweep_trial import PlanningProblem
 from rehearsal.planning.trial_workers import TrialWorkers
-from rehearsal.settings import probe_with_settings
 from rehearsal.worker_processes import WorkerError, Workers
-from render.viewer import Controls, Settings
+from render.viewer import Controls, PlanSettings
 from scenes.anatomy import LoadedAnatomy
-from scenes.scene import with_options
 from ultrasound.target import Target
 
 TRIALS, SPEED_MM_S = 24, 10.0
@@ -91,21 +90,21 @@ class PlanControl:
         self.case, self.anatomy, self.measurements, self.out = case, anatomy, measurements, out
         self.notices = notices
         self._job: PlanJob | None = None
-        self._plan_for: Target = Settings().plan_for
+        self._plan_for: Target = PlanSettings().plan_for
 
     @property
     def status(self) -> str:
         """A line for the panel while a plan is made."""
         return "" if self._job is None else self._job.status
 
-    def control(self, controls: Controls) -> None:
+    def control(self, controls: Controls[LiveSettings]) -> None:
         """Take a frame's controls, and a search that has ended."""
         if controls.next_plan:
             self._stop_or_next_sweep()
         elif controls.plan:
             self._begin(controls.settings)
-        elif controls.settings.plan_for != self._plan_for:
-            self._plan_for = controls.settings.plan_for
+        elif controls.settings.plan.plan_for != self._plan_for:
+            self._plan_for = controls.settings.plan.plan_for
             no_tumour = "" if self.case.tumour is not None else "No tumour here. "
             target = TARGET_NAMES[self._target(controls.settings)]
             self.notices.post(f"{no_tumour}A plan for {target}: {{plan}}")
@@ -127,26 +126,19 @@ class PlanControl:
         else:
             self.notices.post(guide.next_sweep() if guide is not None else "No plan: {plan} makes one")
 
-    def _target(self, settings: Settings) -> Target:
-        return settings.plan_for if self.case.tumour is not None else "organ"
+    def _target(self, settings: LiveSettings) -> Target:
+        return settings.plan.plan_for if self.case.tumour is not None else "organ"
 
-    def _begin(self, settings: Settings) -> None:
+    def _begin(self, settings: LiveSettings) -> None:
         if self._job is not None:
             self.notices.post("A plan is being made")
             return
         target = self._target(settings)
-        # With the tissue, solver settings and gravity of the sliders.
-        values = {
-            "tissue.young_kpa": settings.young_kpa,
-            "tissue.stiffness": settings.stiffness,
-            "solver.iterations": settings.iterations,
-            "solver.substeps": settings.substeps,
-            "gravity.acceleration_m_s2": settings.gravity_m_s2,
-        }
-        scene = with_options(self.case.scene, values)
-        probe = probe_with_settings(self.case.probe, settings)
-        margin_mm = float(settings.margin_mm)
-        problem = PlanningProblem(scene, self.anatomy, probe, target, margin_mm, scene.trocar)
+        scene = self.case.scene.model_copy(
+            update=dict(tissue=settings.tissue, solver=settings.solver, gravity=settings.gravity)
+        )
+        margin_mm = settings.plan.margin_mm
+        problem = PlanningProblem(scene, self.anatomy, settings.probe, target, margin_mm, scene.trocar)
         self._job = PlanJob(problem, next_plan_path(self.out))
         self.notices.post(f"Planning for {TARGET_NAMES[target]}")
 

@@ -10,7 +10,7 @@ from rehearsal.resection.operation import LEAST_SEEN, IsSeen, distance_to_tumour
 from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.resection_state import Point
 from rehearsal.resection.score_line import LEAST_MARKS, ResectionError, ScoreLine, score_line
-from render.viewer import Score, Settings
+from render.viewer import Score, WindowSettings
 from sim.fields import array_of
 from sim.lattice import CellInterpolation
 from sim.skinning import Skin
@@ -26,11 +26,11 @@ UNSEEN = (
 )
 
 
-def cut_settings(settings: Settings) -> CutSettings:
+def cut_settings(settings: WindowSettings) -> CutSettings:
     """How the sliders say that the next cut is made."""
-    depth_mm = float(settings.cut_depth_mm) or None
-    filling: Filling = "air" if settings.air_in_crater else "fluid"
-    return CutSettings(settings.technique, float(settings.margin_mm), depth_mm, filling)
+    resection = settings.resection
+    filling: Filling = "air" if resection.air_in_crater else "fluid"
+    return CutSettings(resection.technique, settings.plan.margin_mm, resection.cut_depth_mm or None, filling)
 
 
 class ResectionView:

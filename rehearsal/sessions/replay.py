@@ -10,6 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from rehearsal.deformed_anatomy import DeformedAnatomy
+from rehearsal.live_settings import LiveSettings, with_recorded
 from rehearsal.loop.command import Bookmark, Checkpoint, Command, Load, SetValues
 from rehearsal.loop.frame import Digest, Frame, Refused
 from rehearsal.loop.history import History
@@ -20,8 +21,7 @@ from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.notices import Notices
 from rehearsal.sessions.packed_arrays import StateError, unpack_state
 from rehearsal.sessions.session_file import ROUNDING_S, Log, SessionError, history_after, makes_state
-from rehearsal.settings import probe_with_settings, set_settings
-from render.viewer import Controls, Settings
+from render.viewer import Controls
 from ultrasound.probe import Probe
 
 # A replay that is further behind the clock than this goes on from there.
@@ -84,7 +84,7 @@ class Replay:
             kept={other: self._state(log.states[other], positions) for other in kept},
         )
 
-    def commands(self, frame: Frame, controls: Controls, elapsed_s: float) -> Iterator[Command]:
+    def commands(self, frame: Frame, controls: Controls[LiveSettings], elapsed_s: float) -> Iterator[Command]:
         """As ``Source.commands``: those of a time [s], unless the steps before are not made yet.
 
         Raises SessionError.
@@ -207,26 +207,27 @@ def open_session(
     at_s: float,
     stepper: Stepper,
     anatomy: DeformedAnatomy,
-    settings: Settings,
+    settings: LiveSettings,
     measurements: LiveMeasurements,
     observers: list[Observer],
-) -> None:
-    """Take a rehearsal to a time [s] of a session: the tissue, the settings, the measurements and the
-    coverage until then.
+) -> LiveSettings:
+    """Take a rehearsal to a time [s] of a session: the tissue, the measurements and the coverage until then;
+    return the settings of that time.
 
-    Raises SessionError.
+    Raises SessionError, UserError.
     """
 
     def apply(commands: Iterable[Command]) -> Frame:
+        nonlocal settings
         for command in commands:
             if isinstance(command, SetValues):
-                set_settings(settings, command.values)
+                settings = with_recorded(settings, command.values)
             stepper.submit(command)
         stepper.wait()
         frame = stepper.newest()
         replay.check(frame)
         anatomy.show(frame)
-        anatomy.find_plane(probe_with_settings(anatomy.case.probe, settings))
+        anatomy.find_plane(settings.probe)
         return frame
 
     frame = apply(replay.begin(anatomy.frame.positions, at_s))
@@ -239,4 +240,5 @@ def open_session(
     for commands in tqdm(replay.until(at_s), desc=f"to {at_s:g} s", total=aim, unit="step", disable=aim == 0):
         frame = apply(commands)
         for observer in observers:
-            observer.observe(frame, probe_with_settings(anatomy.case.probe, settings))
+            observer.observe(frame, settings.probe)
+    return settings

@@ -1,16 +1,18 @@
 """The scene's scripted press, and a replay that the user may take over."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 
+from rehearsal.live_settings import LiveSettings
 from rehearsal.loop.command import Command, Move, NewSession, SetValues
 from rehearsal.loop.frame import Frame
 from rehearsal.loop.protocols import Source
 from rehearsal.notices import Notices
 from rehearsal.sessions.replay import Replay
 from render.viewer import Controls
+from settings import live_values
 
 
 class ScriptedPress:
@@ -21,10 +23,10 @@ class ScriptedPress:
     def __init__(self, pose_at: Callable[[float, np.ndarray], np.ndarray], steps: int) -> None:
         self._pose_at, self._steps, self._made = pose_at, steps, 0
 
-    def commands(self, frame: Frame, controls: Controls, elapsed_s: float) -> Iterator[Command]:
+    def commands(self, frame: Frame, controls: Controls[LiveSettings], elapsed_s: float) -> Iterator[Command]:
         """As ``Source.commands``: one move."""
         if self._made == 0:
-            yield SetValues(values=asdict(controls.settings))
+            yield SetValues(values=live_values(controls.settings))
         self._made += 1
         yield Move(pose=self._pose_at(self._made / self._steps, frame.pose))
 
@@ -44,7 +46,7 @@ class ReplaySource:
         """As ``Source.status``."""
         return self.replay.status if self.user is None else self.user.status
 
-    def commands(self, frame: Frame, controls: Controls, elapsed_s: float) -> Iterable[Command]:
+    def commands(self, frame: Frame, controls: Controls[LiveSettings], elapsed_s: float) -> Iterable[Command]:
         """As ``Source.commands``. Raises SessionError."""
         if self.user is not None:
             return self.user.commands(frame, controls, elapsed_s)

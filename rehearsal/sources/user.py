@@ -3,7 +3,6 @@ and the operation.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from time import perf_counter
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from errors import UserError
 from rehearsal.deformed_anatomy import DeformedAnatomy
+from rehearsal.live_settings import LiveSettings
 from rehearsal.loop.command import (
     BeginAction,
     Bookmark,
@@ -34,6 +34,7 @@ from rehearsal.resection.script import ResectionScript, ScriptedAction
 from rehearsal.sources.hand import Hand
 from rehearsal.sources.tracker import TrackEnded, Tracker
 from render.viewer import Controls
+from settings import live_values
 from ultrasound.probe_manipulator import ManipulatorState, ProbeManipulator
 
 # A transducer that moves by no more than this between two frames is at rest [mm].
@@ -68,7 +69,7 @@ class UserSource:
         self._script, self._plan, self._is_seen = script, resection_plan, is_seen
         # The pose that the hand asked for last.
         self._goal = anatomy.pose
-        self._set: dict[str, Any] = {}
+        self._settings: LiveSettings | None = None
         self._actions = ActionTimes()
         # What restores a state, until it was applied: a pose that was asked for before would undo it.
         self._awaited: Command | None = None
@@ -85,7 +86,7 @@ class UserSource:
         """Whether mouse, keys and gamepad move the transducer, and no tracked probe."""
         return self.tracker is None
 
-    def commands(self, frame: Frame, controls: Controls, elapsed_s: float) -> Iterator[Command]:
+    def commands(self, frame: Frame, controls: Controls[LiveSettings], elapsed_s: float) -> Iterator[Command]:
         """As ``Source.commands``."""
         self._see(frame, controls)
         if controls.frozen:
@@ -116,7 +117,7 @@ class UserSource:
             manipulator=self.hand.manipulator.state,
         )
 
-    def _see(self, frame: Frame, controls: Controls) -> None:
+    def _see(self, frame: Frame, controls: Controls[LiveSettings]) -> None:
         """Take notice of what was done."""
         self._pace = frame.pace
         done = [event.command for event in frame.events if isinstance(event, Applied | Refused)]
@@ -125,7 +126,7 @@ class UserSource:
         if frame.restored:
             self._stay(frame, controls)
 
-    def _stay(self, frame: Frame, controls: Controls) -> None:
+    def _stay(self, frame: Frame, controls: Controls[LiveSettings]) -> None:
         """The transducer is where a restored state has it, and stays until the user moves it."""
         self._goal = frame.pose
         if frame.manipulator is None:
@@ -137,14 +138,16 @@ class UserSource:
         if self.tracker is not None:
             self.tracker.wait()
 
-    def _changed_settings(self, controls: Controls) -> Iterator[Command]:
-        values = asdict(controls.settings)
-        changed = {name: value for name, value in values.items() if self._set.get(name) != value}
+    def _changed_settings(self, controls: Controls[LiveSettings]) -> Iterator[Command]:
+        if controls.settings is self._settings:
+            return
+        before = {} if self._settings is None else live_values(self._settings)
+        self._settings, values = controls.settings, live_values(controls.settings)
+        changed = {path: value for path, value in values.items() if before.get(path) != value}
         if changed:
-            self._set = values
             yield SetValues(values=changed)
 
-    def _restores(self, frame: Frame, controls: Controls) -> Command | None:
+    def _restores(self, frame: Frame, controls: Controls[LiveSettings]) -> Command | None:
         """Undo, redo, reset, or the last bookmark, the one before it when asked again."""
         if controls.bookmark:
             self._next_bookmark = 0
@@ -163,9 +166,9 @@ class UserSource:
             return GoTo(state=frame.bookmarks[self._next_bookmark])
         return None
 
-    def _operates(self, frame: Frame, controls: Controls) -> Iterator[Command]:
+    def _operates(self, frame: Frame, controls: Controls[LiveSettings]) -> Iterator[Command]:
         """Marks of the score, or a cut, as the user or the script asks for it; say what cannot be done."""
-        margin_mm = float(controls.settings.margin_mm)
+        margin_mm = controls.settings.plan.margin_mm
         if controls.score_under is not None:
             origin, direction = controls.score_under
             yield from self._marks(lambda: mark_under(self.anatomy, origin, direction))
@@ -212,7 +215,7 @@ class UserSource:
         )
         return places_at_rest(self.anatomy.case, np.array(planned.marks_mm))
 
-    def _pose(self, frame: Frame, controls: Controls, elapsed_s: float) -> np.ndarray:
+    def _pose(self, frame: Frame, controls: Controls[LiveSettings], elapsed_s: float) -> np.ndarray:
         """The pose that the hand or the tracked probe asks for."""
         if self.tracker is None:
             return self.hand.pose(controls, self._goal, elapsed_s)

@@ -119,8 +119,8 @@ def doppler() -> Iterator[CaseFigures]:
 def frames() -> Iterator[CaseFigures]:
     """A frame of the window with its picture, off-screen, drawn by the Vulkan driver."""
     from rehearsal.drawn_geometry import drawn_geometry
+    from rehearsal.live_settings import initial_settings
     from rehearsal.opening import compile_picture
-    from rehearsal.settings import initial_settings
     from render.window import Window
 
     start_s = perf_counter()

@@ -18,10 +18,10 @@ from rehearsal.commands.command_line import arch_option
 from rehearsal.configuration import PRESETS, Setup, scene_of
 from rehearsal.deformed_anatomy import SURROUNDINGS_MM
 from rehearsal.imaging import image_view
+from rehearsal.live_settings import initial_settings
 from rehearsal.loop.command import Move
 from rehearsal.pressed_organ import PressedOrgan, material_of
 from rehearsal.rehearsal import Rehearsal
-from rehearsal.settings import initial_settings, probe_with_settings
 from rehearsal.stopwatch import timed
 from render.background_image import BackgroundImage
 from render.window_layout import WindowLayout
@@ -30,6 +30,7 @@ from scenes.mechanical_tissues import mechanical_properties
 from scenes.scene import PAPER, Contact, Image, Scene, SolverSection
 from scenes.surfaces import translated
 from scenes.tissue import TISSUES, USUAL, PartMaterial, Prony, ShapeMatchingTissue, TissueSection
+from settings import with_values
 from sim.attachment import Pedicle, Tether
 from sim.device import start
 from sim.embedding import Embedding
@@ -315,14 +316,12 @@ def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
     """A whole frame but the 3D view: a step in a press, surfaces, B-mode and the composed window."""
     rehearsal.reset()
     case, page = rehearsal.case, BackgroundImage(WindowLayout(1280, 720))
-    settings = initial_settings(case)
-    settings.mode = "b-mode"
+    settings = with_values(initial_settings(case), {"image.mode": "b-mode"})
     depths = iter(np.linspace(0.0, case.press.indentations_mm[0], CALLS + 1))
 
     def compute_frame() -> None:
         rehearsal.do(Move(pose=rehearsal.pose_at_depth(next(depths))))
-        probe = probe_with_settings(case.probe, settings)
-        page.compose(image_view(rehearsal.anatomy, probe, settings), np.eye(3), slow_figures=True)
+        page.compose(image_view(rehearsal.anatomy, settings), np.eye(3), slow_figures=True)
 
     whole = [rehearsal.organ, rehearsal.anatomy]
     return _alone("whole frame, with B-mode", compute_frame, whole, None)

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 import psutil
@@ -15,7 +15,6 @@ from rehearsal.commands.command_line import (
     ARGUMENT,
     ArchOptions,
     CommandError,
-    ImageOptions,
     QualityOptions,
     command,
 )
@@ -46,8 +45,10 @@ BEGIN_S = 2.0
 MEMORY_EVERY_S = 60.0
 
 
-class FrameOptions(ImageOptions, QualityOptions, ArchOptions):
+class FrameOptions(QualityOptions, ArchOptions):
     """What is measured."""
+
+    scene_sections: ClassVar = ("transducer", "image")
 
     scene: Annotated[Path, ARGUMENT] = EMBEDDED
     out: Path
@@ -165,8 +166,8 @@ def figures_of(run: "RehearsalRun", hand: ScriptedHand, asked: FrameOptions) -> 
         **scene.tissue.model_dump(),
         time_step_s=scene.solver.time_step_s,
         rate=asked.rate,
-        substeps=settings.substeps,
-        iterations=settings.iterations,
+        substeps=settings.solver.substeps,
+        iterations=settings.solver.iterations,
         drivers=[device.name for device in vulkan_devices()],
         window=[layout.width, layout.height],
         picture=scene.image.mode,

@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from rehearsal.commands.command_line import arch_option
 from rehearsal.configuration import PRESETS
+from rehearsal.live_settings import initial_settings
 from rehearsal.loop.command import Checkpoint, Follow
 from rehearsal.notices import Notices
 from rehearsal.real_time.pace import Pace
@@ -17,12 +18,12 @@ from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.recorder import SessionRecorder, header_of, next_path
 from rehearsal.sessions.replay import Replay, ReplayCheck
 from rehearsal.sessions.session_file import Log, read_log
-from rehearsal.settings import initial_settings
 from rehearsal.sources.user import UserSource
 from render.viewer import Controls
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import EMBEDDED
 from scenes.tissue import TISSUES, USUAL
+from settings import Value, with_values
 from studies.harness import build
 from studies.study_options import number_option, open_study, out_option, preset_option, scene_argument
 from studies.study_results import write_results
@@ -122,10 +123,12 @@ def restless_controls(rehearsal: Rehearsal, steps: int) -> Iterator[Controls]:
             lasting |= {name: float(random.normal(0, deviation)) for name, deviation in MOVES.items()}
             for name, probability in PROBABILITY.items():
                 setattr(controls, name, bool(random.random() < probability))
-            if settings.young_kpa is not None and random.random() < 0.1:
-                settings.young_kpa = float(random.uniform(8, 25))
+            changes: dict[str, Value] = {}
+            if settings.tissue.model == "neo-hookean" and random.random() < 0.1:
+                changes["tissue.young_kpa"] = float(random.uniform(8, 25))
             if random.random() < 0.1:
-                settings.iterations = int(random.integers(3, 7))
+                changes["solver.iterations"] = int(random.integers(3, 7))
+            controls.settings = settings = with_values(settings, changes)
         for name, value in lasting.items():
             setattr(controls, name, value)
         yield controls

@@ -12,10 +12,12 @@ import pytest
 from coarse_patient import coarse_patient
 from null_viewer import NullViewer
 from plan_ball import plan_of, sweep_of
+from settings_at_start import settings_with
 
 from rehearsal import run
 from rehearsal.asked_files import AskedFiles
 from rehearsal.commands.rehearse_options import RehearseOptions
+from rehearsal.live_settings import DEFAULT_KEYS, initial_settings
 from rehearsal.loop.command import Move
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.notices import Notices
@@ -28,8 +30,6 @@ from rehearsal.real_time.started_process import start_process
 from rehearsal.rehearsal import Rehearsal, begin
 from rehearsal.sessions.replay import Replay, ReplayCheck
 from rehearsal.sessions.session_file import Log, read_log
-from rehearsal.settings import initial_settings
-from render.keys import Keys
 from render.viewer import Controls, Settings
 from scenes.anatomy import LoadedAnatomy, fingerprint
 from sim.device import start
@@ -130,7 +130,7 @@ def test_every_tool_works_at_every_pace(built, process, tmp_path, capsys, pace):
     manipulator = begin(case, anatomy, process)
     settings, link = initial_settings(case), LiveLink()
     viewer = NullViewer(settings, everything(rehearsal, settings))
-    files = AskedFiles(Path(), case.scene, case.probe, Keys(), plan=plan_down(rehearsal, loaded))
+    files = AskedFiles(Path(), case.scene, case.probe, DEFAULT_KEYS, plan=plan_down(rehearsal, loaded))
     asked = RehearseOptions(out=tmp_path, link=True)
     built_for_window = run.Built(anatomy, process, manipulator, model.counts, model.serial)
     each = run.RehearsalRun(built_for_window, loaded, "cpu", asked, files, viewer, link)
@@ -159,6 +159,6 @@ def replayed(rehearsal: Rehearsal, log: Log) -> ReplayCheck:
     rehearsal.reset()
     replay, check = Replay(log, one_by_one=True), ReplayCheck(log, Notices())
     while not replay.is_over:
-        frame = rehearsal.do(*replay.commands(rehearsal.frame, Controls(Settings()), 0.0))
+        frame = rehearsal.do(*replay.commands(rehearsal.frame, Controls(settings_with()), 0.0))
         check.observe(frame, rehearsal.case.probe)
     return check

@@ -15,7 +15,7 @@ from rehearsal.measurements.live_measurements import MEASURE_S, LiveMeasurements
 from rehearsal.measurements.tumour_measurements import Measurement
 from rehearsal.sessions.packed_arrays import pack_seen
 from rehearsal.sessions.session_file import Header, Log, SessionError
-from render.viewer import Settings, View
+from render.viewer import View, ViewSettings
 from ultrasound.probe import load_probe
 
 PROBE, VIEW = load_probe("linear"), View(np.eye(4), {}, 40.0, 60.0)
@@ -67,12 +67,12 @@ def test_the_guide_is_followed_and_its_figures_are_recorded(measurements):
     observed(measurements, *FIRST)
     assert [round(each["plan_followed"], 3) for each in noted] == [round(n / 7, 3) for n in (1, 2, 3, 4)]
     assert all(each["plan_off_mm"] == 0 and "seen_margin" in each for each in noted)
-    view = measurements.onto(VIEW, Settings())
+    view = measurements.onto(VIEW, ViewSettings())
     assert view.guidance.goal == pytest.approx(SECOND[0]) and view.findings["plan"] == "57 %"
     measurements.restart()
     assert measurements.guide.next_pose == 0
     measurements.guide = None
-    assert measurements.onto(view, Settings()).guidance is None
+    assert measurements.onto(view, ViewSettings()).guidance is None
     assert "plan_followed" not in measurements.figures()
 
 
@@ -96,7 +96,7 @@ def test_what_a_session_holds_is_recalled_as_it_was_measured(measurements, anato
     assert again.recall(log, 5)
     assert again.figures() == measurements.figures() and again.summary(2) == measurements.summary(2)
     assert (again.course.presses, again.course.went_back, again.guide.next_pose) == (1, 1, 4)
-    view = again.onto(VIEW, Settings(show_seen=True))
+    view = again.onto(VIEW, ViewSettings(show_seen=True))
     assert view.findings["tumour volume seen"] == "100 %" and view.seen["tumour"].any()
     del log.readings[1]["contact_mm2"]
     with pytest.raises(SessionError, match="without compression or contact"):
@@ -113,7 +113,7 @@ def test_after_an_undo_it_is_measured_anew_at_once(measurements, monkeypatch):
     measurements.note = lambda number, reading: noted.append(reading["compression_mm"])
     for frame in (frame_at(FIRST[0]), frame_at(FIRST[0], 1, 1 / 60), undone(1, 1 / 60)):
         measurements.observe(frame, PROBE)
-    view = measurements.onto(VIEW, Settings())
+    view = measurements.onto(VIEW, ViewSettings())
     assert view.findings["compression"] == "0.2 mm" and noted == [9.0, 0.2] and view.notes
     assert view.alert == ""
 
@@ -153,7 +153,7 @@ def test_an_image_is_said_to_have_no_contact_where_hardly_a_line_touches(
     touches = np.arange(PROBE.number_of_scanlines) < touching
     monkeypatch.setattr(measurements.coverage, "add", lambda *_: touches)
     measurements.observe(frame_at(FIRST[0]), PROBE)
-    assert measurements.onto(VIEW, Settings()).notes == notes
+    assert measurements.onto(VIEW, ViewSettings()).notes == notes
 
 
 def test_the_panel_shows_each_figure_under_its_name_with_its_unit(measurements, monkeypatch):
@@ -173,11 +173,11 @@ def test_the_panel_shows_each_figure_under_its_name_with_its_unit(measurements, 
         "tumour volume seen": "46 %",
         "+8 mm seen": "79 %",
     }
-    shown = measurements.onto(VIEW, Settings())
+    shown = measurements.onto(VIEW, ViewSettings())
     assert (shown.alert, shown.status) == ("compression", "TISSUE COMPRESSED BY 8 mm")
     # The scene's limit is 8 mm.
     measurements.latest = Measurement(8.0, 123.4)
-    shown = measurements.onto(VIEW, Settings())
+    shown = measurements.onto(VIEW, ViewSettings())
     assert (shown.alert, shown.status) == ("", "")
 
 

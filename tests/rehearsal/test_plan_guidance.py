@@ -1,13 +1,16 @@
 """Guidance along a plan: progress, the lines in the 3D view, and the keys."""
 
 from itertools import pairwise
+from typing import get_args
 
 import numpy as np
 import pytest
 from conftest import rotation_about
 from fake_organ import fake_timeline
 from plan_ball import SIZE, guide_over_ball, plan_of, straight_pass, sweep_of
+from settings_at_start import settings_with
 
+from rehearsal.live_settings import DEFAULT_KEYS
 from rehearsal.loop.command import (
     BeginAction,
     Bookmark,
@@ -22,12 +25,12 @@ from rehearsal.loop.command import (
 )
 from rehearsal.planning.plan_guidance import ABOVE_MM, AHEAD, DEG_PER_MM_OFF, NEAR_MM, PlanGuidance
 from render import scene_view, transducer_shape
-from render.keys import Keys, begin
+from render.keys import begin
 from render.scene_view import DONE, TO_GO, PlanLines
-from render.viewer import Controls, Guidance, Settings
+from render.viewer import Controls, Guidance
 from sim.fields import Field, array_of
 from ultrasound.probe_manipulator import advanced
-from ultrasound.target import TARGETS
+from ultrasound.target import Target
 
 FIRST, SECOND = straight_pass(4, step_mm=2.0), straight_pass(3, 20.0, 2.0)
 
@@ -313,15 +316,16 @@ def test_every_second_segment_of_a_path_with_too_many_is_drawn(one_device, monke
 
 
 def test_the_keys_of_a_plan():
-    keys = Keys()
+    keys = DEFAULT_KEYS
     heard = {" ": "plan_for", "Return": "plan", "BackSpace": "next_plan"}
     assert {key: keys.action_of(key) for key in heard} == heard
-    controls, targets = Controls(Settings()), []
+    controls, targets = Controls(settings_with()), []
     begin("plan", controls)
     assert controls.plan and not controls.next_plan
     begin("next_plan", controls)
     assert controls.next_plan
-    for _ in TARGETS:
+    order = get_args(Target)
+    for _ in order:
         begin("plan_for", controls)
-        targets.append(controls.settings.plan_for)
-    assert targets == [*TARGETS[1:], TARGETS[0]] and Settings().plan_for == TARGETS[0]
+        targets.append(controls.settings.plan.plan_for)
+    assert targets == [*order[1:], order[0]] and settings_with().plan.plan_for == order[0]

@@ -17,6 +17,7 @@ from plan_ball import (
     straight_pass,
     sweep_of,
 )
+from settings_at_start import settings_with
 
 from rehearsal.notices import Notices
 from rehearsal.planning import plans_in_window
@@ -24,9 +25,8 @@ from rehearsal.planning.plan_file import PlanError, read_plan
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plan_search import total_work
 from rehearsal.planning.plans_in_window import SPEED_MM_S, TRIALS, PlanControl, minutes_in_words
-from rehearsal.settings import probe_with_settings
 from rehearsal.worker_processes import WorkerError
-from render.viewer import Controls, Settings
+from render.viewer import Controls
 from scenes.anatomy import LoadedAnatomy
 from ultrasound.probe import load_probe
 
@@ -94,13 +94,16 @@ def plans_for(tumour, out) -> PlanControl:
     return PlanControl(case, LoadedAnatomy(case.organ, tumour, None, ()), followed, out, Notices())
 
 
+WIDER = settings_with({"plan.margin_mm": 7.0})
+
+
 @pytest.fixture
 def plans(tmp_path) -> PlanControl:
     return plans_for(trimesh.creation.icosphere(radius=7.0), tmp_path)
 
 
 def message(plans: PlanControl, **controls) -> str:
-    settings = controls.pop("settings", None) or Settings()
+    settings = controls.pop("settings", None) or settings_with()
     plans.control(Controls(settings, **controls))
     return "".join(plans.notices.present())
 
@@ -113,9 +116,7 @@ def ended(plans: PlanControl) -> str:
 
 def test_a_plan_is_made_during_the_rehearsal_and_then_followed(searching, plans, tmp_path):
     assert plans.status == ""
-    assert (
-        message(plans, plan=True, settings=Settings(margin_mm=7)) == "Planning for the tumour and its margin"
-    )
+    assert message(plans, plan=True, settings=WIDER) == "Planning for the tumour and its margin"
     assert message(plans) == "" and plans.status == "PLANNING   0 %; {next_plan} stops"
     searching.run_trials(3)
     assert plans.status.startswith(f"PLANNING   {300 / total_work(TRIALS, SPEED_MM_S):.0f} %, ")
@@ -130,9 +131,9 @@ def test_a_plan_is_made_during_the_rehearsal_and_then_followed(searching, plans,
         "margin",
         7.0,
         plans.anatomy,
-        probe_with_settings(PROBE, Settings(margin_mm=7)),
+        WIDER.probe,
     )
-    assert problem.scene.solver.iterations == Settings().iterations
+    assert problem.scene.solver.iterations == WIDER.solver.iterations
     assert message(plans, plan=True) == "Planning for the tumour and its margin"
     searching.run_trials(4)
     ended(plans)
@@ -239,12 +240,11 @@ def test_one_processor_is_left_to_the_rehearsal(monkeypatch, searching, plans, p
 
 
 def test_the_target_is_shown_and_without_a_tumour_it_is_the_organ(searching, plans, tmp_path):
-    settings = Settings()
     for target, words in (("tumour", "the tumour"), ("organ", "the whole kidney")):
-        settings.plan_for = target
+        settings = settings_with({"plan.plan_for": target})
         assert message(plans, settings=settings) == f"A plan for {words}: {{plan}}"
         assert message(plans, settings=settings) == ""
-    plans, settings.plan_for = plans_for(None, tmp_path), "tumour"
+    plans, settings = plans_for(None, tmp_path), settings_with({"plan.plan_for": "tumour"})
     assert message(plans, settings=settings) == "No tumour here. A plan for the whole kidney: {plan}"
     assert message(plans, settings=settings, plan=True) == "Planning for the whole kidney"
     searching.run_trials(4)

@@ -75,7 +75,7 @@ def solver(started, reference) -> SolverProcess:
     """The process, paused and at rest, as the reference is."""
     started.submit(Pause())
     started.submit(GoTo(state=0))
-    started.submit(SetValues(values={"young_kpa": 15.0}))
+    started.submit(SetValues(values={"tissue.young_kpa": 15.0}))
     started.wait()
     assert started.newest().pose.tobytes() == reference.manipulator.pose().tobytes()
     reference.reset()
@@ -152,12 +152,12 @@ def test_paused_it_makes_no_steps_and_moves_are_made_one_by_one(solver, referenc
     poses = [advanced(reference.manipulator.pose(), depth) for depth in np.linspace(0.1, 2.0, 8)]
     lengths = np.linspace(1 / 200, 1 / 20, 8).tolist()
     moves = [Move(pose=pose, length_s=length) for pose, length in zip(poses, lengths, strict=True)]
-    softer = SetValues(values={"young_kpa": 30.0})
+    softer = SetValues(values={"tissue.young_kpa": 30.0})
     for command in (softer, *moves):
         solver.submit(command)
     solver.wait()
     frame, here = solver.newest(), reference.do(softer, *moves)
-    reference.do(SetValues(values={"young_kpa": 15.0}))
+    reference.do(SetValues(values={"tissue.young_kpa": 15.0}))
     assert len(frame.steps) == 8 and frame.positions.tobytes() == here.positions.tobytes()
     assert frame.wrench == pytest.approx(here.wrench)
 

@@ -12,8 +12,8 @@ from slicing import hounsfield, organ_mask
 
 from rehearsal.case import case_of
 from rehearsal.imaging import image_view
+from rehearsal.live_settings import initial_settings
 from rehearsal.rehearsal import Rehearsal, script_length_s
-from rehearsal.settings import initial_settings
 from scenes.anatomy import load_anatomy
 from scenes.patients.patient_folder import save_patient
 from scenes.patients.patient_import import import_patient
@@ -23,6 +23,7 @@ from scenes.patients.readers.label_maps import LabelMap
 from scenes.phantom.embedded_patient import phantom_folder
 from scenes.scene import PAPER, Press, Scene, load_scene, with_options
 from scenes.volumes.lazy_volume import LazyVolume
+from settings import with_values
 from sim.fields import array_of
 from sim.signed_distance import signed_distance
 from ultrasound.persistence import Persistence
@@ -213,7 +214,7 @@ def test_every_feature_at_once_without_a_ct_stays_finite_and_out_of_everything(o
     assert np.isfinite(rehearsal.frame.positions).all()
     assert 0.6 < anatomy.volume_ratio() < 1.1
     assert anatomy.scanner is None and anatomy.rest_grid() is None
-    view = image_view(anatomy, rehearsal.case.probe, initial_settings(rehearsal.case))
+    view = image_view(anatomy, initial_settings(rehearsal.case))
     assert not any(image.any() for image in view.images.values())
 
 
@@ -225,21 +226,20 @@ def test_an_image_has_the_rows_and_columns_asked_for_and_at_most_the_scenes(rehe
         ((pixels + 1, 30), (pixels, 30)),
         ((30, pixels + 1), (30, pixels)),
     ):
-        view = image_view(rehearsal.anatomy, case.probe, initial_settings(case), times, asked)
+        view = image_view(rehearsal.anatomy, initial_settings(case), times, asked)
         assert {image.shape[:2] for image in view.images.values()} == {made}
     assert len(times) == 3 and min(times) > 0
 
 
 def test_an_image_that_is_saved_leaves_the_persistence_of_those_shown_as_it_is(rehearsal):
-    settings = initial_settings(rehearsal.case)
-    settings.persistence_percent, settings.mode = 60, "b-mode"
+    values = {"scanner.persistence_percent": 60, "image.mode": "b-mode"}
+    settings = with_values(initial_settings(rehearsal.case), values)
     poses = [rehearsal.pose_at_depth(depth) for depth in (1.0, 2.0, 3.0)]
 
     def image(pose: np.ndarray, persistence: Persistence | None) -> np.ndarray:
         rehearsal.organ.pose = pose
         rehearsal.show()
-        given = rehearsal.anatomy, rehearsal.case.probe, settings
-        return image_view(*given, persistence=persistence).images[B_MODE]
+        return image_view(rehearsal.anatomy, settings, persistence=persistence).images[B_MODE]
 
     first, second = Persistence(), Persistence()
     shown = [image(pose, first) for pose in poses]

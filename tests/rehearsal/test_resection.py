@@ -12,6 +12,7 @@ import pytest
 import trimesh
 from coarse_patient import coarse_patient
 from conftest import ROOT
+from settings_at_start import settings_with
 
 from rehearsal.announcements import Announcements
 from rehearsal.asked_files import read_files
@@ -57,7 +58,7 @@ from rehearsal.sessions.replay import Replay, ReplayCheck
 from rehearsal.sessions.session_file import Log, read_log
 from rehearsal.sources.user import UserSource
 from rehearsal.tracking.pose_file import PoseError, load_timed_poses
-from render.viewer import Controls, Settings
+from render.viewer import Controls
 from scenes.scene import with_options
 from scenes.surfaces import signed_distance_from
 from sim.fields import Field
@@ -278,7 +279,7 @@ def replayed(rehearsal: Rehearsal, log: Log, at_s: float) -> tuple[int, ReplayCh
     rehearsal.do(*replay.begin(rehearsal.frame.positions, at_s))
     begun = replay.place
     while not replay.is_over:
-        rehearsal.do(*replay.commands(rehearsal.frame, Controls(Settings()), 1.0))
+        rehearsal.do(*replay.commands(rehearsal.frame, Controls(settings_with()), 1.0))
         check.observe(rehearsal.frame, rehearsal.case.probe)
     return begun, check
 
@@ -396,7 +397,9 @@ def test_the_view_warns_of_a_line_that_is_too_near_and_shows_the_coming_cut(rehe
     look(2.0, True)
     depth = shown.section()[..., 1].max() - anatomy.tumour_outline()[..., 1].max()
     assert MARGIN_MM - 1.0 < depth < MARGIN_MM + 1.0
-    assert asdict(cut_settings(Settings(cut_depth_mm=12, air_in_crater=True, technique="wedge"))) == dict(
+    wedge = dict(cut_depth_mm=12.0, air_in_crater=True, technique="wedge")
+    settings = settings_with({f"resection.{name}": value for name, value in wedge.items()})
+    assert asdict(cut_settings(settings)) == dict(
         technique="wedge", margin_mm=5.0, depth_mm=12.0, filling="air"
     )
 
@@ -411,7 +414,7 @@ def source_of(
 
 def acted(rehearsal: Rehearsal, source: UserSource, **controls) -> list[str]:
     """The frame after a user's controls; return the notices."""
-    given = Controls(Settings(young_kpa=15.0, iterations=4, substeps=1), **controls)
+    given = Controls(settings_with(), **controls)
     frame = rehearsal.do(*source.commands(rehearsal.frame, given, 1 / 60))
     return [*frame.notices, *source.notices.present()]
 

@@ -17,6 +17,7 @@ import pytest
 import trimesh
 from fake_organ import STEP_S, fake_timeline
 from recorded_session import LiveSession, header, record_all
+from settings_at_start import settings_with
 
 import app
 from rehearsal.configuration import probe_of
@@ -42,7 +43,7 @@ from rehearsal.sessions.session_file import (
     scene_of_log,
     settings_apart,
 )
-from render.viewer import Controls, Settings
+from render.viewer import Controls
 from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import EMBEDDED, Scene, load_scene
 
@@ -289,7 +290,7 @@ def replayed(log: Any, notices: Notices) -> ReplayCheck:
         ReplayCheck(log, notices),
     )
     while not replay.is_over:
-        for command in replay.commands(stepper.newest(), Controls(Settings()), STEP_S):
+        for command in replay.commands(stepper.newest(), Controls(settings_with()), STEP_S):
             stepper.submit(command)
         frame = stepper.newest()
         replay.check(frame)
@@ -324,7 +325,7 @@ def test_a_replay_keeps_pace_with_the_clock_and_does_not_run_away_from_a_slow_so
     replay, stepper = Replay(read_log(tmp_path / "session")), fake_timeline()
 
     def given(elapsed_s: float) -> int:
-        commands = replay.commands(stepper.newest(), Controls(Settings()), elapsed_s)
+        commands = replay.commands(stepper.newest(), Controls(settings_with()), elapsed_s)
         return sum(isinstance(command, Move) for command in list(commands))
 
     # The stepper gets none of them.

@@ -17,6 +17,7 @@ from rehearsal import headless, run
 from rehearsal.asked_files import AskedFiles
 from rehearsal.build_solver import step_settings
 from rehearsal.commands.rehearse_options import RehearseOptions
+from rehearsal.live_settings import DEFAULT_KEYS, LiveSettings, initial_settings
 from rehearsal.loop import timeline
 from rehearsal.loop.command import Move, NewSession, SetValues
 from rehearsal.measurements.live_measurements import LiveMeasurements
@@ -24,13 +25,12 @@ from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.packed_arrays import pack_seen
 from rehearsal.sessions.replay import Replay, open_session
 from rehearsal.sessions.session_file import Header, Log, SessionError, makes_state, read_log
-from rehearsal.settings import initial_settings
 from rehearsal.tracking.pose_file import TimedPoses
 from rehearsal.window_loop import PREPARING
-from render.keys import Keys
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy
+from settings import with_values
 from sim.device import start
 from ultrasound import coverage
 from ultrasound.probe_manipulator import ManipulatorState
@@ -88,15 +88,14 @@ def rewound(rehearsal: Rehearsal) -> Rehearsal:
     scene, organ = rehearsal.case.scene, rehearsal.organ
     rehearsal.reset()
     organ.settings = step_settings(scene.tissue, scene.solver)
-    organ.set_gravity(scene.gravity.acceleration_m_s2)
-    organ.set_young(scene.tissue.young_kpa)
+    organ.set(scene.tissue, scene.solver, scene.gravity)
     rehearsal.manipulator.state = ManipulatorState()
     rehearsal.do(NewSession(pose=rehearsal.manipulator.pose()))
     return rehearsal
 
 
 def files_of(rehearsal: Rehearsal, **named: Any) -> AskedFiles:
-    return AskedFiles(Path(), rehearsal.case.scene, rehearsal.case.probe, Keys(), **named)
+    return AskedFiles(Path(), rehearsal.case.scene, rehearsal.case.probe, DEFAULT_KEYS, **named)
 
 
 def run_of(
@@ -122,30 +121,37 @@ def rehearsed(built, monkeypatch, out: Path, script: Any, log: Log | None = None
     return viewer.seen, rehearsal.organ.digest(), recorder and read_log(recorder.path)
 
 
-def user(settings: Settings, frames: int = 150) -> Iterator[Controls]:
+def user(settings: LiveSettings, frames: int = 150) -> Iterator[Controls]:
     """All there is to do, in 140 moments and ten frozen frames."""
     for frame in range(frames):
-        settings.young_kpa = 40.0 if 30 <= frame < 50 else 15.0
-        settings.iterations = 3 if 40 <= frame < 60 else 8
-        settings.gain_percent = 40 if frame < 85 else 75
-        settings.depth_mm = 20 if 60 <= frame < 108 else 40
+        values = {
+            "tissue.young_kpa": 40.0 if 30 <= frame < 50 else 15.0,
+            "solver.iterations": 3 if 40 <= frame < 60 else 8,
+            "probe.gain_percent": 40.0 if frame < 85 else 75.0,
+            "probe.depth_mm": 20.0 if 60 <= frame < 108 else 40.0,
+        }
         over = np.array([0.1 * (frame % 100) - 5.0, -80.0, 3.0]), np.array([0.0, 1.0, 0.0])
         keys = dict(undo=frame in (70, 71, 140), redo=frame == 72, bookmark=frame in (20, 98))
         keys |= dict(to_bookmark=frame in (110, 112), reset=frame == 130, freeze=frame in (80, 90))
         at = over if frame % 40 < 30 else None
         tilt_deg = 0.5 * (frame % 7 == 0)
         yield Controls(
-            settings, at, press=frame % 40 > 15, tilt_deg=tilt_deg, quit=frame == frames - 1, **keys
+            with_values(settings, values),
+            at,
+            press=frame % 40 > 15,
+            tilt_deg=tilt_deg,
+            quit=frame == frames - 1,
+            **keys,
         )
 
 
 def watching(frames: int, take_over_at: int = -1) -> Any:
-    def script(settings: Settings) -> Iterator[Controls]:
+    def script(settings: LiveSettings) -> Iterator[Controls]:
         for frame in range(frames):
             press = 0 <= take_over_at < frame
             news = "Gamepad ready" if frame == 0 else ""
             last = frame == frames - 1
-            yield Controls(settings, take_over=frame == take_over_at, press=press, quit=last, message=news)
+            yield Controls(None, take_over=frame == take_over_at, press=press, quit=last, message=news)
 
     return script
 
@@ -157,7 +163,7 @@ def test_a_rehearsal_is_replayed_to_the_bit_and_the_pixel(built, monkeypatch, tm
     seen, end, log = rehearsed(built, monkeypatch, tmp_path, user)
     assert len(seen) == 150 and len(set(seen)) > 120 and log.summary["went_back"] == 7
     values = [command.values for _, command in log.commands if isinstance(command, SetValues)]
-    assert len({each["iterations"] for each in values if "iterations" in each}) > 1
+    assert len({each["solver.iterations"] for each in values if "solver.iterations" in each}) > 1
     assert log.steps == 140 - 7 - 2
     for at_s in (0.0, 1.8):
         rest = sum(makes_state(command) for _, command in log.commands[log.place_at(at_s) :])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from fake_organ import STEP_S
 from recorded_session import record_all
+from settings_at_start import settings_with
 from user_at_ball import UserAtBall, ray
 
 from rehearsal.loop.command import BeginAction, GoTo, NewSession
@@ -15,8 +16,10 @@ from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session_file import read_log
 from rehearsal.sources.scripted import ReplaySource, ScriptedPress
 from rehearsal.sources.user import LONGEST_S, PAUSE_S, ActionTimes
-from render.viewer import Controls, Settings
+from render.viewer import Controls
 from ultrasound.probe_manipulator import advanced
+
+STIFFER = settings_with({"tissue.young_kpa": 30.0})
 
 
 def test_actions_begin_after_a_pause_with_a_press_and_after_five_seconds():
@@ -91,8 +94,8 @@ def test_no_pose_is_given_until_an_undo_was_applied():
     user = UserAtBall()
     for x_mm in (1.0, 3.0, 5.0):
         user.step(ray=ray(x_mm))
-    controls = Controls(Settings(young_kpa=15.0), ray=ray(-5.0))
-    undo = Controls(Settings(young_kpa=15.0), undo=True)
+    controls = Controls(settings_with(), ray=ray(-5.0))
+    undo = Controls(settings_with(), undo=True)
     late = user.frame
     (command,) = user.source.commands(late, undo, STEP_S)
     # The solver's process has not seen it yet.
@@ -109,12 +112,11 @@ def test_no_pose_is_given_until_an_undo_was_applied():
 
 def test_only_settings_that_change_are_given_all_at_first():
     user, changed = UserAtBall(), []
-    settings = Settings(young_kpa=15.0)
-    for young_kpa, gain in ((15.0, 50), (15.0, 50), (30.0, 50), (30.0, 70)):
-        settings.young_kpa, settings.gain_percent = young_kpa, gain
-        user.step(settings)
+    for young_kpa, gain in ((15.0, 50.0), (15.0, 50.0), (30.0, 50.0), (30.0, 70.0)):
+        user.step(settings_with({"tissue.young_kpa": young_kpa, "probe.gain_percent": gain}))
         changed.append(user.set)
-    assert len(changed[0]) > 30 and changed[1:] == [{}, {"young_kpa": 30.0}, {"gain_percent": 70}]
+    assert len(changed[0]) > 30
+    assert changed[1:] == [{}, {"tissue.young_kpa": 30.0}, {"probe.gain_percent": 70.0}]
     assert user.timeline.organ.young_kpa == 30.0
 
 
@@ -148,10 +150,10 @@ def test_without_a_bookmark_there_is_none_to_go_to():
 def test_frozen_nothing_moves_and_settings_wait():
     user = UserAtBall()
     pose = user.step(ray=ray(2.0))
-    user.step(Settings(young_kpa=30.0), ray=ray(5.0), frozen=True)
+    user.step(STIFFER, ray=ray(5.0), frozen=True)
     assert user.kinds == ["pause"] and np.array_equal(user.frame.pose, pose)
-    user.step(Settings(young_kpa=30.0))
-    assert user.set == {"young_kpa": 30.0}
+    user.step(STIFFER)
+    assert user.set == {"tissue.young_kpa": 30.0}
 
 
 def test_an_action_begins_before_the_pose_that_it_moves_to():
@@ -197,7 +199,7 @@ def test_a_replay_is_taken_over_in_a_new_session(tmp_path):
         source = ReplaySource(replay, lambda: user.source, notices)
         frame, given = user.frame, []
         for count in range(200):
-            controls = Controls(Settings(young_kpa=15.0), take_over=taken_over and count == 20)
+            controls = Controls(settings_with(), take_over=taken_over and count == 20)
             given = list(source.commands(frame, controls, STEP_S))
             for command in given:
                 user.stepper.submit(command)
@@ -208,7 +210,7 @@ def test_a_replay_is_taken_over_in_a_new_session(tmp_path):
         assert frame.begins is not None and frame.number == 1 and replay.is_over != taken_over
         said = "Mouse and keys control the probe"
         assert notices.present() == [said if taken_over else f"The replay has ended. {said}"]
-        assert list(source.commands(frame, Controls(Settings(young_kpa=15.0)), STEP_S))[-1].kind == "follow"
+        assert list(source.commands(frame, Controls(settings_with()), STEP_S))[-1].kind == "follow"
 
 
 def test_a_scripted_press_makes_a_move_for_each_of_its_steps():
@@ -216,7 +218,7 @@ def test_a_scripted_press_makes_a_move_for_each_of_its_steps():
     home = user.manipulator.home
     press = ScriptedPress(lambda share, pose: advanced(home, 4.0 * share), 4)
     for _ in range(4):
-        for command in press.commands(user.frame, Controls(Settings(young_kpa=15.0)), STEP_S):
+        for command in press.commands(user.frame, Controls(settings_with()), STEP_S):
             user.stepper.submit(command)
     frame = user.stepper.newest()
     assert len(frame.steps) == 4 and np.allclose(frame.pose, advanced(home, 4.0))

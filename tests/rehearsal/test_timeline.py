@@ -10,6 +10,7 @@ import pytest
 from fake_organ import STEP_S, fake_timeline, pose_at
 from hypothesis import settings, strategies
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from settings_at_start import settings_with
 
 from rehearsal.loop import timeline as timeline_module
 from rehearsal.loop.command import (
@@ -33,10 +34,13 @@ from rehearsal.notices import Notices
 from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import Replay, ReplayCheck
 from rehearsal.sessions.session_file import Header, read_log
-from render.viewer import Controls, Settings
+from render.viewer import Controls
 
 # Whole states are recorded this often, so that short sessions have several.
 CHECKPOINT_S = 2.0
+
+
+CHANGES = [{"solver.iterations": 2}, {"tissue.young_kpa": 20.0}, {"gravity.acceleration_m_s2": 1.0}]
 
 
 def header() -> Header:
@@ -68,7 +72,7 @@ def repeated(path: Path, at_s: float = 0.0) -> tuple[Timeline, ReplayCheck]:
     while not replay.is_over:
         frame = stepper.newest()
         check.observe(frame, None)
-        for command in replay.commands(frame, Controls(Settings()), STEP_S):
+        for command in replay.commands(frame, Controls(settings_with()), STEP_S):
             stepper.submit(command)
     frame = stepper.newest()
     replay.check(frame)
@@ -108,7 +112,7 @@ class AnySession(RuleBasedStateMachine):
     def move_on(self, x: float, count: int) -> None:
         self.do(*(Move(pose=pose_at(x * n / count)) for n in range(count)))
 
-    @rule(values=strategies.sampled_from([{"iterations": 2}, {"young_kpa": 20.0}, {"gravity_m_s2": 1.0}]))
+    @rule(values=strategies.sampled_from(CHANGES))
     def set(self, values: dict) -> None:
         self.do(SetValues(values=values))
 

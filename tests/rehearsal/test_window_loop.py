@@ -13,6 +13,7 @@ import pytest
 from click.exceptions import Exit
 from fake_organ import STEP_S, fake_timeline
 from null_viewer import NullViewer
+from settings_at_start import settings_with
 from test_openigtlink import LiveImage
 from user_at_ball import ball_manipulator
 
@@ -22,19 +23,19 @@ from rehearsal.announcements import Announcements
 from rehearsal.asked_files import AskedFiles
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.imaging import captions, readouts, scale_texts
+from rehearsal.live_settings import DEFAULT_KEYS
 from rehearsal.loop.command import BeginAction, Bookmark, Move, NewSession, SetValues, Undo
 from rehearsal.loop.frame import Frame, Step
 from rehearsal.notices import Notices
 from rehearsal.window_loop import PREPARING, WindowLoop
 from rehearsal.window_panel import WindowPanel
-from render.keys import DEFAULT_KEYS, Keys
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
 from scenes.scene import EMBEDDED, SceneError, load_scene
 from scenes.terminal import shell_command
 from ultrasound.probe import load_probe
 
-FILES = AskedFiles(Path(), load_scene(EMBEDDED), load_probe("linear"), Keys())
+FILES = AskedFiles(Path(), load_scene(EMBEDDED), load_probe("linear"), DEFAULT_KEYS)
 
 
 class FakeAnatomy:
@@ -129,7 +130,7 @@ class Looping:
         self.plans = SimpleNamespace(status="", control=lambda controls: None)
         self.panel = WindowPanel(
             *(self.anatomy, self.source, self.measurements, announcements, resection, self.plans),
-            *(self.notices, out, Keys(), {"nodes": 7}, link, warnings),
+            *(self.notices, out, DEFAULT_KEYS, {"nodes": 7}, link, warnings),
         )
         observers = [self.measurements, announcements]
         self.loop = WindowLoop(
@@ -202,9 +203,10 @@ def test_frozen_the_solver_makes_no_step_and_what_changes_the_tissue_ends_it(loo
 
 
 def test_the_settings_of_a_replay_are_the_windows(looping):
-    looping.source.also = [SetValues(values={"depth_mm": 44, "gain_percent": 63})]
+    looping.source.also = [SetValues(values={"probe.depth_mm": 44.0, "probe.gain_percent": 63.0})]
     looping.next()
-    assert looping.viewer.settings.depth_mm == 44 and looping.viewer.settings.gain_percent == 63
+    probe = looping.viewer.settings.probe
+    assert (probe.depth_mm, probe.gain_percent) == (44.0, 63.0)
     looping.next()
     assert looping.measurements.observed[-1] == (2, 44.0)
 
@@ -298,7 +300,7 @@ def test_a_pace_that_differs_is_said_once(tmp_path, capsys):
 
 
 def test_notices_name_the_users_keys_on_the_screen_and_in_the_terminal(looping, capsys):
-    looping.panel.keys = Keys(of=DEFAULT_KEYS | {"sweep": "Space", "plan_for": "L"})
+    looping.panel.keys = replace(DEFAULT_KEYS, of=DEFAULT_KEYS.of | {"sweep": "Space", "plan_for": "L"})
     looping.notices.post("sweep-001: {sweep} ends it")
     assert looping.next().status == "Sweep-001: Space ends it"
     assert capsys.readouterr().out == "sweep-001: Space ends it\n"
@@ -375,11 +377,12 @@ def test_the_clock_is_the_sessions_and_says_where_it_is_slow(looping):
 
 def test_the_texts_around_the_image_are_its_settings_and_times():
     own = dict(gain_percent=63.0, dyn_range_db=72.0, frequency_mhz=9.5, velocity_scale_cm_s=18.0)
-    probe = load_probe("linear").model_copy(update=own)
-    settings = Settings(window_hu=360, level_hu=35, clamped=True, mode="both", doppler="colour")
+    values = {f"probe.{name}": value for name, value in own.items()}
+    values |= {"image.window_hu": 360.0, "image.level_hu": 35.0, "scanner.clamped": True}
+    settings = settings_with(values)
     b_mode = "9.5 MHz   G 63 %   DR 72 dB   speckle   hilum clamped"
-    assert captions(probe, settings)[1:] == (b_mode, "W 360   L 35 HU")
-    assert scale_texts(probe, settings) == ("+18", "-18")
+    assert captions(settings)[1:] == (b_mode, "W 360   L 35 HU")
+    assert scale_texts(settings.probe, "colour") == ("+18", "-18")
     # Medians of the last thirty.
     step_ms, image_ms = [90.0] * 40 + [4.0] * 14 + [5.0] * 2 + [99.0] * 14, [7.0, 8.0, 30.0]
     shown = {"step": "5.0 ms", "image": "8.0 ms", "elements": "9000", "indentation": "0.0 mm"}
@@ -396,7 +399,7 @@ def test_the_latency_is_the_median_of_the_last_frames(looping):
 def test_without_contact_whoever_moves_the_probe_by_hand_is_told_how_to_press(looping, monkeypatch):
     looping.measurements.alert = {"notes": {"B-mode": "NO CONTACT"}}
     monkeypatch.setattr(window_panel, "UserSource", SimpleNamespace)
-    looping.panel.keys = Keys({**DEFAULT_KEYS, "push": "Return"})
+    looping.panel.keys = replace(DEFAULT_KEYS, of=DEFAULT_KEYS.of | {"push": "Return"})
     notes = []
     by_hand, tracked = (SimpleNamespace(is_manual=manual, status="") for manual in (True, False))
     for source in (looping.source, by_hand, tracked):
@@ -488,7 +491,7 @@ def test_without_a_window_images_go_to_the_link_and_the_tissue_into_the_folder(
     tally = SimpleNamespace(slice_ms=[], add=lambda rehearsal, frame: None, report=lambda *_: {})
     resection = SimpleNamespace(update=lambda *_: None, score=lambda _: None)
     source, measurements = OneMove(), FakeMeasurements()
-    source.also = [SetValues(values={"depth_mm": 44})]
+    source.also = [SetValues(values={"probe.depth_mm": 44.0})]
     link = SimpleNamespace(send=lambda *live: sent.append(LiveImage(*live)))
     loop = headless.HeadlessLoop(
         *(
@@ -496,7 +499,7 @@ def test_without_a_window_images_go_to_the_link_and_the_tissue_into_the_folder(
             source,
             measurements,
             [measurements],
-            Settings(),
+            settings_with(),
             tally,
             Notices(),
             resection,

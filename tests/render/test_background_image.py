@@ -2,10 +2,12 @@
 pictures.
 """
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 import pytest
+from settings_at_start import settings_with
 
 from render.background_image import (
     ARM,
@@ -19,13 +21,14 @@ from render.background_image import (
     readout_image,
 )
 from render.camera import OrbitCamera
-from render.keys import DEFAULT_KEYS, Keys
+from render.keys import default_keys
 from render.sliders import boxes_of, groups_of
 from render.text import fitting_size, font, shortened, write
 from render.ultrasound_panel import ALERT, CALIPER, OUTLINE, OUTLINE_AT_REST, QUIET, TEXT, to_plane
-from render.viewer import SCANNER_GROUPS, Geometry, Settings, View
+from render.viewer import SCANNER_GROUPS, Geometry, View
 from render.warning_box import warning_lines, warning_rect
 from render.window_layout import Rect, WindowLayout
+from scenes.tissue import NeoHookeanTissue, ShapeMatchingTissue
 
 LAYOUT = WindowLayout(1280, 720)
 AXES = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, 1.0, 0]])
@@ -70,6 +73,8 @@ def geometry(**parts) -> Geometry:
     return Geometry((None, np.zeros((0, 3))), np.zeros((2, 3)), **parts)
 
 
+KEYS = default_keys()
+ALL_BOXES = {"view.show_scanner": True, "resection.show_resection": True}
 WHOLE = geometry(tumour=(1, 1), parts={"vessel": (1, 1)}, support=(1, 1))
 
 
@@ -77,8 +82,7 @@ WHOLE = geometry(tumour=(1, 1), parts={"vessel": (1, 1)}, support=(1, 1))
 @pytest.mark.parametrize("size", [(700, 420), (1024, 600), *SCREENS])
 def test_no_part_of_the_window_overlaps_another(size, doppler):
     layout = WindowLayout(*size)
-    settings = Settings(young_kpa=15.0, show_scanner=True, show_resection=True)
-    settings.doppler = doppler
+    settings = settings_with(ALL_BOXES | {"scanner.doppler": doppler})
     placed = boxes_of(settings, WHOLE, layout)
     shown = [box for name, box in placed.items() if name in SCANNER_GROUPS]
     assert len(shown) == (1 if size == (700, 420) else 3) and "Resection" in placed
@@ -106,31 +110,38 @@ def test_b_mode_and_ct_of_the_drop_in_probe_fill_the_panel():
 @each_size
 def test_the_first_sliders_are_left_out_where_there_is_no_room(size):
     layout = WindowLayout(*size)
-    names = list(boxes_of(Settings(young_kpa=15.0), WHOLE, layout))
+    names = list(boxes_of(settings_with(), WHOLE, layout))
     assert (layout.readouts.width == 0) == (size in ((700, 420), (1024, 600)))
     assert names == (["Image", "View"] if size == (700, 420) else ["Tissue", "Image", "View"])
 
 
 @pytest.mark.parametrize("width", [*range(704, 1600, 64), 1250, 2560, 3840])
-@pytest.mark.parametrize("tissue, doppler", [("young_kpa", "off"), ("stiffness", "power")])
-def test_labels_of_sliders_are_whole(width, tissue, doppler):
-    settings = Settings(**{tissue: 0.9}, show_scanner=True, show_resection=True, doppler=doppler)
+@pytest.mark.parametrize(
+    "tissue, doppler",
+    [(NeoHookeanTissue(), "off"), (ShapeMatchingTissue(model="shape-matching"), "power")],
+    ids=["young", "stiffness"],
+)
+def test_labels_of_controls_are_whole(width, tissue, doppler):
+    settings = settings_with(ALL_BOXES | {"scanner.doppler": doppler}).model_copy(update={"tissue": tissue})
     layout = WindowLayout(width, width * 9 // 16)
     groups = groups_of(settings, WHOLE)
     for name, box in boxes_of(settings, WHOLE, layout).items():
         # Rows that do not fit have a scroll bar, 14 pixels wide.
         scrolls = 23 * len(groups[name]) + 31 > box.height
         assert not scrolls or width < 1024
-        for about in (member.metadata for member in groups[name]):
-            label = 7 * len(f"{about['label']} {about['unit']}".strip())
-            # Pixels around a label, and of a switch, as Dear ImGui draws them.
-            room = box.width - 35 if isinstance(about["low"], bool) else 0.35 * box.width - 16
+        for setting in groups[name]:
+            values = (
+                [] if setting.choices in ((), (False, True)) else [f": {value}" for value in setting.choices]
+            )
+            label = 7 * (len(setting.label) + max(map(len, values), default=0))
+            # Pixels around a label, and of a switch or button, as Dear ImGui draws them.
+            room = box.width - 35 if setting.choices else 0.35 * box.width - 16
             assert label <= room + 0.2
 
 
 def test_a_missing_structure_has_no_slider():
     def named(shown: Geometry) -> set[str]:
-        groups = groups_of(Settings(young_kpa=15.0), shown)
+        groups = groups_of(settings_with(), shown)
         return {each.name for members in groups.values() for each in members}
 
     whole = named(WHOLE)
@@ -283,7 +294,7 @@ def test_all_readouts_of_a_window_are_shown(size):
 @pytest.mark.parametrize("help_key", ["H", "Backspace"])
 def test_clock_and_pace_stand_between_title_and_help_in_every_window(size, help_key):
     layout, told = WindowLayout(*size), {"clock": "1234.5 s", "title": "A long title of a patient " * 5}
-    page = BackgroundImage(layout, Keys({**DEFAULT_KEYS, "help": help_key}))
+    page = BackgroundImage(layout, replace(KEYS, of={**KEYS.of, "help": help_key}))
     box = clock_box(layout, help_key)
     bare, real, slow = (composed(page, **told | more) for more in ({"clock": ""}, {}, {"pace": "0.2 x real"}))
     assert set(np.unique(bare[box.slices])) == {17, 20, 24}

@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from settings_at_start import settings_with
 
 from render.gamepad import DEAD_STICK, SLIDE_MM_S, Gamepad, PadState, SdlPads, shaped
 from render.keys import BUTTONS, DEFAULT_BUTTONS, TILT_DEG_S
-from render.viewer import Controls, Settings
+from render.viewer import Controls
 
 SECONDS = 0.02
 
@@ -26,7 +27,7 @@ class MadeUp:
 
 def read(*states: PadState | None, **did) -> list[Controls]:
     pad = Gamepad(MadeUp(*states), DEFAULT_BUTTONS)
-    found = [Controls(Settings(), **did) for _ in states]
+    found = [Controls(settings_with(), **did) for _ in states]
     for controls in found:
         pad.read(controls, SECONDS)
     return found

@@ -5,17 +5,21 @@ import pytest
 from conftest import ROOT
 from PIL import ImageDraw
 
+from rehearsal.live_settings import DEFAULT_KEYS
 from render.background_image import help_image, in_columns
-from render.keys import KEY_MAP, Keys
 from render.window_layout import FULL_SIZE, WindowLayout
 
-LINES = [keys for group in KEY_MAP.values() for keys in group.values()]
+LINES = [
+    {action: DEFAULT_KEYS.of[action] for action in actions}
+    for group in DEFAULT_KEYS.groups.values()
+    for actions in group.values()
+]
 
 
 def key_table() -> str:
     """The key map as docs/keys.md has it."""
     rows = ["| Key | What it does |", "| --- | --- |"]
-    for group, lines in Keys().lines().items():
+    for group, lines in DEFAULT_KEYS.lines().items():
         rows += [f"| **{group}** | |", *(f"| {keys} | {text} |" for keys, text in lines)]
     return "\n".join(rows)
 
@@ -55,7 +59,7 @@ def test_all_keys_fit_into_the_help_of_any_window(monkeypatch, size):
         text(draw, place, words, **how)
 
     monkeypatch.setattr(ImageDraw.ImageDraw, "text", noted)
-    picture = help_image(layout, Keys().lines())
+    picture = help_image(layout, DEFAULT_KEYS.lines())
     assert picture.shape == (size[1], size[0], 3)
     boxes = np.array([box for box, _ in written if box[2] > box[0]])
     assert (boxes[:, :2] >= 0).all() and (boxes[:, 2:] <= size).all()
@@ -68,7 +72,7 @@ def test_all_keys_fit_into_the_help_of_any_window(monkeypatch, size):
 
 
 def test_help_keeps_each_group_together_under_its_name():
-    groups = Keys().lines()
+    groups = DEFAULT_KEYS.lines()
     columns = in_columns(groups)
     assert max(map(len, columns)) <= 0.6 * sum(map(len, columns))
     rows = [row for column in columns for row in column]

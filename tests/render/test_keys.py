@@ -6,26 +6,24 @@ import sys
 
 import pytest
 from conftest import ROOT
+from settings_at_start import settings_with
 
 import app
+from rehearsal.live_settings import DEFAULT_KEYS as USUAL
+from rehearsal.live_settings import LiveSettings
 from render.keys import (
-    CYCLES,
-    DEFAULT_BUTTONS,
-    DEFAULT_KEYS,
     HELD,
-    KEY_MAP,
     KEYS,
-    MOUSE,
     STEPS,
     VIEW_ACTIONS,
-    Keys,
     KeysError,
     begin,
     hold,
     keys_text,
     load_keys,
 )
-from render.viewer import Controls, Settings
+from render.viewer import Controls
+from settings import settings_in
 
 
 def file_of(tmp_path, text: str):
@@ -36,7 +34,7 @@ def file_of(tmp_path, text: str):
 
 def refused(tmp_path, text: str) -> str:
     with pytest.raises(KeysError) as error:
-        load_keys(file_of(tmp_path, text))
+        load_keys(file_of(tmp_path, text), USUAL)
     assert "\n" not in str(error.value) and "keys.toml: " in str(error.value)
     return str(error.value)
 
@@ -49,12 +47,10 @@ def test_every_action_does_one_thing():
         for each in dataclasses.fields(Controls)
         if each.default is False and each.name not in no_keys
     }
-    switches = {each.name for each in dataclasses.fields(Settings) if isinstance(each.default, bool)}
-    does = [*MOUSE, *HELD, *STEPS, *CYCLES, *VIEW_ACTIONS, "help"]
-    for action in (*MOUSE, *DEFAULT_KEYS):
-        kinds = does.count(action) + (action in flags) + (action in switches)
-        assert kinds == 1, action
-    assert flags <= set(DEFAULT_KEYS), "controls that no key reaches"
+    settings = [setting.name for setting in settings_in(LiveSettings) if setting.key is not None]
+    mouse = USUAL.of.keys() - USUAL.keyed.keys()
+    does = [*mouse - flags, *HELD, *STEPS, *VIEW_ACTIONS, "help", *flags, *settings]
+    assert sorted(does) == sorted(USUAL.of)
 
 
 def test_a_held_key_cannot_be_with_shift(tmp_path):
@@ -62,15 +58,16 @@ def test_a_held_key_cannot_be_with_shift(tmp_path):
 
 
 def test_an_action_changes_what_it_is_named_for():
-    controls = Controls(Settings())
+    controls = Controls(settings_with())
     for action in ("undo", "sweep", "cut", "translucent", "mode", "cine_back", "cine_back", "cine_forth"):
         begin(action, controls)
     settings = controls.settings
+    mode = settings.image.mode
     assert controls.undo and controls.sweep and not controls.redo and controls.cine == -1
-    assert settings.cut and not settings.translucent and settings.mode == "b-mode"
+    assert settings.view.cut and not settings.view.translucent and mode == "b-mode"
     begin("mode", controls)
     begin("mode", controls)
-    assert settings.mode == "both"
+    assert controls.settings.image.mode == "both"
     before = dataclasses.replace(controls)
     for action in ("push", "help", "zoom_in", ""):
         begin(action, controls)
@@ -91,7 +88,7 @@ def test_an_action_changes_what_it_is_named_for():
     ],
 )
 def test_a_held_action_goes_on_with_time(action, name, a_second):
-    controls = Controls(Settings(), **{name: 1.0})
+    controls = Controls(settings_with(), **{name: 1.0})
     hold(action, controls, 0.1)
     assert controls == Controls(controls.settings, **{name: pytest.approx(1.0 + 0.1 * a_second)})
     hold("undo", controls, 0.1)
@@ -101,10 +98,10 @@ def test_a_held_action_goes_on_with_time(action, name, a_second):
 def test_the_printed_file_is_the_usual_map(tmp_path, capsys):
     assert app.main(["keys"]) == 0
     printed = capsys.readouterr().out
-    assert printed == keys_text()
-    keys = load_keys(file_of(tmp_path, printed))
-    assert keys.of == DEFAULT_KEYS and keys.buttons == DEFAULT_BUTTONS
-    assert load_keys(file_of(tmp_path, "")).of == DEFAULT_KEYS
+    assert printed == keys_text(USUAL)
+    keys = load_keys(file_of(tmp_path, printed), USUAL)
+    assert keys == USUAL
+    assert load_keys(file_of(tmp_path, ""), USUAL) == USUAL
 
 
 def test_a_file_changes_behaviour_help_and_words(tmp_path):
@@ -113,7 +110,8 @@ def test_a_file_changes_behaviour_help_and_words(tmp_path):
             tmp_path,
             '[keys]\npush = "i"\nexport = "w"\nfreeze = "space"\nhelp = "Return"\nplan_for = "f"\nplan = '
             '"h"\n[gamepad]\nundo = "guide"\nredo = "b"\n',
-        )
+        ),
+        USUAL,
     )
     assert [keys.action_of(key) for key in ("i", "w", " ", "f", "h", "F1", "Return", "Escape")] == [
         "push",
@@ -127,9 +125,9 @@ def test_a_file_changes_behaviour_help_and_words(tmp_path):
     ]
     assert dict(keys.held())["push"] == "i" and dict(keys.held())["zoom_in"] == "Up"
     groups = keys.lines()
-    assert list(groups) == list(KEY_MAP) and list(map(len, groups.values())) == list(
-        map(len, KEY_MAP.values())
-    )
+    assert {group: len(rows) for group, rows in groups.items()} == {
+        group: len(rows) for group, rows in USUAL.groups.items()
+    }
     lines = {text: key for rows in groups.values() for key, text in rows}
     assert lines["push it in, lift it"] == "I / S" and lines["freeze and unfreeze"] == "Space"
     assert [key for key, _ in groups["Transducer"]][:2] == ["Mouse", "Left button"]
@@ -138,16 +136,16 @@ def test_a_file_changes_behaviour_help_and_words(tmp_path):
 
 
 def test_every_usual_key_is_a_key_and_there_once():
-    assert set(DEFAULT_KEYS.values()) <= set(KEYS) and len(set(DEFAULT_KEYS.values())) == len(DEFAULT_KEYS)
-    assert [Keys().action_of(KEYS[key]) for key in DEFAULT_KEYS.values()] == list(DEFAULT_KEYS)
+    assert len(set(USUAL.of.values())) == len(USUAL.of)
+    assert [USUAL.action_of(KEYS[key]) for key in USUAL.keyed.values()] == list(USUAL.keyed)
     # With shift a key that has no action of its own with it has its usual one.
-    assert [Keys().action_of(key, with_shift=True) for key in ("x", "m", "w", "F1")] == [
+    assert [USUAL.action_of(key, with_shift=True) for key in ("x", "m", "w", "F1")] == [
         "cut_out",
         "score_image",
         "push",
         "",
     ]
-    assert [Keys().action_of(key) for key in ("x", "m")] == ["cut", "bookmark"]
+    assert [USUAL.action_of(key) for key in ("x", "m")] == ["cut", "bookmark"]
     assert len(set(KEYS.values())) == len(KEYS)
 
 

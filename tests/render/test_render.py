@@ -13,16 +13,19 @@ import pytest
 import taichi as ti
 import trimesh
 from conftest import ROOT
+from settings_at_start import settings_with
 
+from rehearsal.live_settings import DEFAULT_KEYS
 from render import background_image, display, transducer_shape, ultrasound_panel
 from render.camera import OrbitCamera
 from render.cut_face import FLESH
 from render.display import display_available, fitted, scale_of, window_size
 from render.sliders import boxes_of, draw_sliders
 from render.software_scene import SoftwareScene
-from render.viewer import Geometry, Settings, View
+from render.viewer import Geometry, View
 from render.warning_box import warning_image, warning_rect
 from render.window_layout import FULL_SIZE, RULER_WIDTH, WindowLayout
+from settings import with_values
 from sim.device import start
 from sim.fields import fill, fill_evenly, zeros
 
@@ -44,16 +47,8 @@ def _view(**changes) -> View:
     )
 
 
-# Settings
-
-
-def test_defaults_lie_in_their_ranges_and_every_setting_can_become_a_slider():
-    for each in (setting for setting in dataclasses.fields(Settings) if setting.metadata):
-        default = each.metadata["high"] if each.default is None else each.default
-        assert each.metadata["low"] <= default <= each.metadata["high"]
-        assert {"label", "unit", "low", "high", "group"} <= set(each.metadata)
-        # The type of the range chooses the widget, so it must be the type of the value.
-        assert type(each.metadata["low"]) is type(each.metadata["high"]) is type(default)
+def change(opened, path: str, value) -> None:
+    opened.settings = with_values(opened.settings, {path: value})
 
 
 # Camera
@@ -236,7 +231,12 @@ def window(request):
     geometry = Geometry((field, ball.faces.astype(np.int32)), np.array([[-45.0] * 3, [45.0] * 3]))
     try:
         opened = Window(
-            geometry, Settings(translucent=False), size=(640, 360), visible=False, by_processor=request.param
+            geometry,
+            settings_with({"view.translucent": False}),
+            size=(640, 360),
+            visible=False,
+            keys=DEFAULT_KEYS,
+            by_processor=request.param,
         )
     except NoVulkan as reason:
         ti.reset()
@@ -307,7 +307,7 @@ def test_organ_never_covers_the_panel_the_title_or_the_readouts(window):
 def test_processor_and_vulkan_draw_the_same_picture(window):
     """But for the pixels at edges, which each assigns by its own rounding."""
     opened, _, _ = window
-    opened.settings.translucent = True
+    change(opened, "view.translucent", True)
     shown = {}
     for by_processor in (False, True):
         opened._software = SoftwareScene(opened.camera, (640, 360)) if by_processor else None
@@ -402,7 +402,7 @@ def test_only_a_box_of_sliders_that_was_moved_is_made_anew(window, mouse, box, w
     opened.read_controls()
     mouse.presses(ti.ui.LMB)
     opened.read_controls()
-    opened.settings.level_hu += changes
+    change(opened, "image.level_hu", 40.0 + changes)
     mouse.goes(left + 30 + way[0], top + 8 + way[1])
     opened.read_controls()
     mouse.releases(ti.ui.LMB)
@@ -412,7 +412,7 @@ def test_only_a_box_of_sliders_that_was_moved_is_made_anew(window, mouse, box, w
 
 def test_the_mouse_over_the_scanners_sliders_does_not_move_the_probe(window, mouse):
     opened, _, _ = window
-    opened.settings.show_scanner = True
+    change(opened, "view.show_scanner", True)
     opened._place_sliders()
     left, top, width, height = opened._slider_boxes["B-mode"]
     mouse.goes(left + width / 2, top + height / 2)
@@ -432,13 +432,17 @@ def test_boxes_of_sliders_are_known_again_when_they_come_back():
         def checkbox(self, label, value):
             return value
 
+        def button(self, label):
+            return False
+
         def slider_int(self, label, value, low, high):
             return value
 
         slider_float = slider_int
 
-    geometry, settings = Geometry((None, np.zeros((0, 3))), BOUNDS), Settings()
-    for settings.show_scanner in (True, False, True):
+    geometry = Geometry((None, np.zeros((0, 3))), BOUNDS)
+    for shown in (True, False, True):
+        settings = settings_with({"view.show_scanner": shown})
         draw_sliders(Gui(), settings, geometry, boxes_of(settings, geometry, LAYOUT), FULL_SIZE, {})
     assert len(names) == 5
     draw_sliders(Gui(), settings, geometry, boxes_of(settings, geometry, LAYOUT), FULL_SIZE, {"TGC": 1})
@@ -450,7 +454,7 @@ def test_the_scanners_sliders_are_in_the_first_picture(window):
     opened, _, _ = window
     opened.draw(_view())
     before = opened.picture()
-    opened.settings.show_scanner = True
+    change(opened, "view.show_scanner", True)
     after = opened.picture()
     changed = np.any(before != after, axis=2)
     assert changed[opened._slider_boxes["B-mode"].slices].mean() > 0.5
@@ -474,12 +478,12 @@ def test_shift_counts_for_the_keys_pressed_with_it_also_in_a_slow_frame(window, 
 
     def cuts(*presses: str, releases: tuple[str, ...] = ()) -> tuple[bool, bool]:
         """Whether the frame cuts along the score, and whether it toggles the section of the view."""
-        before = opened.settings.cut
+        before = opened.settings.view.cut
         for key in presses:
             mouse.presses(key)
         for key in releases:
             mouse.releases(key)
-        return opened.read_controls().cut_out, opened.settings.cut != before
+        return opened.read_controls().cut_out, opened.settings.view.cut != before
 
     assert cuts("x", releases=("x",)) == (False, True)
     assert cuts(ti.ui.SHIFT, "x", releases=("x", ti.ui.SHIFT)) == (True, False)
@@ -502,7 +506,7 @@ def test_other_geometry_has_its_own_sliders(window):
 def test_the_bed_of_a_cut_is_solid_in_a_translucent_organ(window, translucent):
     opened, field, _ = window
     faces = opened._geometry.organ[1]
-    opened.settings.translucent = translucent
+    change(opened, "view.translucent", translucent)
     opened.draw(_far_view())
     before = opened.picture().astype(int)
     opened.change_geometry(dataclasses.replace(opened._geometry, bed=(field, faces[: len(faces) // 2])))
@@ -510,19 +514,21 @@ def test_the_bed_of_a_cut_is_solid_in_a_translucent_organ(window, translucent):
     assert brighter[opened.layout.clear.slices].any() == translucent
 
 
-@pytest.mark.parametrize(("setting", "value"), [("translucent", True), ("cut", True), ("level_hu", 90)])
+@pytest.mark.parametrize(
+    ("setting", "value"), [("view.translucent", True), ("view.cut", True), ("image.level_hu", 90.0)]
+)
 def test_settings_are_seen(window, setting, value):
     opened, _, _ = window
     opened.draw(_view())
     before = opened.picture()
-    setattr(opened.settings, setting, value)
+    change(opened, setting, value)
     assert np.any(opened.picture() != before)
     assert opened.read_controls().settings is opened.settings
 
 
 def test_the_cut_is_filled_and_the_half_before_it_removed(window):
     opened, _, _ = window
-    opened.settings.cut = True
+    change(opened, "view.cut", True)
     pose = np.array(_view().transducer_pose)
     # The image plane is square to the view, but for the height that it is seen from.
     _, _, ahead = opened.camera.axes()

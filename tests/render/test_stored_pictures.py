@@ -15,9 +15,10 @@ import trimesh
 from conftest import rotation_about
 from lattice_tissue import put, tissue_of
 from PIL import Image
+from settings_at_start import settings_with
 
 from render.ultrasound_panel import OUTLINE, draw_segments, image_boxes, paste_image
-from render.viewer import Geometry, Settings, View
+from render.viewer import Geometry, View
 from render.window_layout import WindowLayout
 from sim.device import start
 from sim.embedding import Embedding
@@ -169,7 +170,7 @@ def window(scene):
         tumour=(scene.tumour.vertices, TUMOUR_SURFACE.faces.astype(np.int32)),
     )
     try:
-        opened = Window(geometry, Settings(), size=WINDOW, visible=False)
+        opened = Window(geometry, settings_with(), size=WINDOW, visible=False)
     except NoVulkan as reason:
         pytest.skip(str(reason))
     yield opened

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from conftest import ROOT
 from PIL import Image
+from settings_at_start import settings_with
 
 from render.sliders import boxes_of, groups_of
 from render.ultrasound_panel import CALIPER
-from render.viewer import Geometry, Settings
+from render.viewer import Geometry
 from render.window_layout import Rect, WindowLayout
 
 pytestmark = pytest.mark.skipif(
@@ -129,7 +130,7 @@ def slider(name: str) -> Rect:
     geometry = Geometry(
         (None, np.zeros((0, 3))), np.zeros((2, 3)), tumour=(1, 1), parts={"vessel": (1, 1)}, support=(1, 1)
     )
-    settings = Settings(young_kpa=15.0)
+    settings = settings_with()
     boxes = boxes_of(settings, geometry, WindowLayout(*WINDOW))
     for group, members in groups_of(settings, geometry).items():
         for place, member in enumerate(members):

@@ -4,12 +4,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from settings_at_start import settings_with
 
 import app
 from rehearsal.loop.frame import Step
 from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.real_time.start_times import StartTimes
-from render.viewer import Controls, Settings
+from render.viewer import Controls
 from scenes.scene import EMBEDDED, load_scene
 from studies.performance import frame_rate
 from studies.performance.frame_rate import (
@@ -31,7 +32,7 @@ class Window:
     """A window that draws nothing."""
 
     running, layout = True, SimpleNamespace(width=1280, height=720)
-    settings = Settings(iterations=4, substeps=1)
+    settings = settings_with()
 
     def quit(self) -> None:
         self.running = False
@@ -68,7 +69,7 @@ def led(hand: ScriptedHand, clock: list[float], most: int = 1000) -> list[Contro
     """
     given = []
     while hand.loop.window.running and len(given) < most:
-        given += hand.commands(None, Controls(Settings()), 0.05)
+        given += hand.commands(None, Controls(settings_with()), 0.05)
         clock[0] += 0.05
         times = hand.loop.times
         times.stages_ms["drawing"].append(50.0)
