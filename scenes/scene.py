@@ -181,10 +181,13 @@ class Trocar(Section):
     angle between probe and shaft: 0 for a rigid one. Without ``at_mm`` the instrument's path is not checked.
     """
 
-    at_mm: Vector3 | None = None
+    at_mm: Annotated[Vector3 | None, "--trocar"] = None
+    """Position of the trocar: x y z, LPS, mm."""
     axis: Direction | None = None
-    cone_deg: float = Field(50.0, gt=0, le=90)
-    wrist_deg: float = Field(90.0, ge=0, le=180)
+    cone_deg: Annotated[float, "--cone-deg"] = Field(50.0, gt=0, le=90)
+    """Largest angle of the shaft to the axis of the trocar."""
+    wrist_deg: Annotated[float, "--wrist-deg"] = Field(90.0, ge=0, le=180)
+    """Largest angle of the probe to the shaft."""
     longest_mm: Length = 250.0
 
 
@@ -412,7 +415,7 @@ def with_options(scene: Scene, options: Mapping[str, float | int | str | None]) 
     except ValidationError as error:
         text = _explain(error)
         for key, option in OPTIONS.items():
-            text = text.replace(key, option)
+            text = re.sub(rf"\b{re.escape(key)}(\.\d+)?\b", option, text)
         raise SceneError(text) from None
 
 

@@ -189,7 +189,7 @@ def test_ctrl_c_ends_it_in_words(tmp_path, monkeypatch, capsys):
     done = run("--version", PYTHONPATH=str(tmp_path))
     assert (done.returncode, done.stderr) == (130, "Stopped.\n")
 
-    def ends(by):
+    def ends(by, keys):
         raise by
 
     for by, words in ((KeyboardInterrupt(), "Stopped."), (click.exceptions.Exit(130), "")):
@@ -331,7 +331,7 @@ def test_mistakes_are_one_line(tmp_path, monkeypatch):
     ],
 )
 def test_what_a_machine_lacks_is_one_line(fault, words, monkeypatch):
-    def fails():
+    def fails(keys):
         raise fault
 
     monkeypatch.setattr("rehearsal.commands.rehearse_command.keys_text", fails)

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from errors import PatientError, UserError, parsing
+from rehearsal.live_settings import DEFAULT_KEYS
 from rehearsal.planning.plan_file import is_plan
 from rehearsal.tracking.pose_file import PoseError, load_poses, load_timed_poses
-from render.keys import Keys, keys_text, load_keys
+from render.keys import keys_text, load_keys
 from scenes.scene import EMBEDDED, SceneError, load_scene
 from studies.number_table import read_numbers
 from text_files import TextError, json_value, read_json, read_text, read_toml, table_rows
@@ -36,7 +37,10 @@ def test_so_are_scenes_probes_keys_plans_and_poses(tmp_path, encoding):
     assert load_probe(str(saved(tmp_path / "probe.toml", probe.read_text("utf-8"), encoding))) == load_probe(
         "linear"
     )
-    assert load_keys(saved(tmp_path / "keys.toml", keys_text(), encoding)) == Keys()
+    assert (
+        load_keys(saved(tmp_path / "keys.toml", keys_text(DEFAULT_KEYS), encoding), DEFAULT_KEYS)
+        == DEFAULT_KEYS
+    )
     assert is_plan(saved(tmp_path / "plan.json", '{"nephron_plan": 1}', encoding))
     pose = [dict(probe_to_patient=np.eye(4).tolist())]
     assert len(load_poses(saved(tmp_path / "poses.json", json.dumps(pose), encoding))) == 1

@@ -227,14 +227,17 @@ def _scene_option(name: str, path: str) -> click.Option:
     choices = [choice for setting in settings for choice in setting.choices]
     if choices == [False, True]:
         return click.Option([OPTIONS[path], name], default=None, help=help)
-    kind = click.Choice(choices) if choices else _click_type(_kind_of(settings[0].field), [])
-    return click.Option([OPTIONS[path], name], type=kind, help=help)
+    kind = _kind_of(settings[0].field)
+    numbers = get_args(kind) if get_origin(kind) is tuple else (kind,)
+    shown = click.Choice(choices) if choices else _click_type(numbers[0], [])
+    return click.Option([OPTIONS[path], name], type=shown, nargs=len(numbers), help=help)
 
 
 def _kind_of(field: FieldInfo) -> Any:
     """The type of a field, without None."""
     is_union = get_origin(field.annotation) in (Union, UnionType)
-    return get_args(field.annotation)[0] if is_union else field.annotation
+    kind = get_args(field.annotation)[0] if is_union else field.annotation
+    return get_args(kind)[0] if get_origin(kind) is Annotated else kind
 
 
 def _parameter(name: str, field: FieldInfo) -> click.Parameter:

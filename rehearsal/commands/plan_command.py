@@ -1,11 +1,11 @@
 """The command ``plan``: a sweep that covers a target with little compression, through a trocar."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import click
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 from tabulate import tabulate
 from tqdm import tqdm
 
@@ -21,7 +21,7 @@ from rehearsal.configuration import probe_of
 from rehearsal.planning.plan_file import FASTEST_MM_S, MOST_MARGIN_MM, MOST_SWEEPS, SLOWEST_MM_S, write_plan
 from rehearsal.result_files import counted
 from scenes.anatomy import fingerprint
-from scenes.scene import EMBEDDED, Trocar
+from scenes.scene import EMBEDDED
 from scenes.terminal import shell_command
 from ultrasound.target import Target
 from version import VERSION
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 class PlanOptions(QualityOptions):
     """What the user asks of a plan."""
+
+    scene_sections: ClassVar = ("transducer", "trocar")
 
     scene: Annotated[Path, ARGUMENT] = EMBEDDED
     out: Path
@@ -44,14 +46,6 @@ class PlanOptions(QualityOptions):
     """
     margin_mm: float = Field(5.0, ge=0, le=MOST_MARGIN_MM)
     """Width of the margin around the tumour."""
-    trocar: tuple[float, float, float] | None = None
-    """Position of the trocar: x y z, LPS, mm [the scene's]."""
-    cone_deg: float | None = None
-    """Largest angle of the shaft to the axis of the trocar [the scene's]."""
-    wrist_deg: float | None = None
-    """Largest angle of the probe to the shaft [the scene's]."""
-    probe: str | None = None
-    """Probe, by its name or as a file [the scene's]."""
     speed_mm_s: float = Field(10.0, ge=SLOWEST_MM_S, le=FASTEST_MM_S)
     """Speed of the planned sweep."""
     trials: int = Field(24, ge=MOST_SWEEPS, le=100_000)
@@ -74,7 +68,7 @@ def plan(asked: PlanOptions) -> None:
     out = asked.out
     click.echo("Reading the patient.")
     loaded, anatomy = load_patient(asked.scene, asked.changes, asked.quality)
-    port, scene_probe = trocar_of(loaded.trocar, asked), probe_of(loaded)
+    scene_probe, trocar = probe_of(loaded), loaded.trocar
     make_place(out, "--out")
     from rehearsal.planning.plan_search import make_plan, total_work
     from rehearsal.planning.sweep_trial import PlanningProblem
@@ -82,8 +76,8 @@ def plan(asked: PlanOptions) -> None:
     from rehearsal.worker_processes import Workers
 
     target: Target = asked.target or ("organ" if anatomy.tumour is None else "margin")
-    problem = PlanningProblem(loaded, anatomy, scene_probe, target, asked.margin_mm, port)
-    if port.at_mm is None:
+    problem = PlanningProblem(loaded, anatomy, scene_probe, target, asked.margin_mm, trocar)
+    if trocar.at_mm is None:
         click.echo("No trocar is given: all poses count as reachable.")
     with (
         Workers(asked.jobs, asked.dask) as workers,
@@ -99,7 +93,7 @@ def plan(asked: PlanOptions) -> None:
     )
     click.echo(
         f"Wrote {counted(len(made.sweeps), 'sweep')} to {out}; follow the first with: "
-        f"{rehearse_command_line(asked.scene, out, asked.probe)}"
+        f"{rehearse_command_line(asked)}"
     )
 
 
@@ -134,7 +128,7 @@ def plan_resection(asked: PlanOptions) -> None:
         click.echo("An enucleation has no margin: --margin-mm 0 plans one.")
     click.echo(
         f"Wrote {counted(len(cuts), 'cut')} to {asked.out}, and a picture of the first to {picture}; "
-        f"rehearse the first in a window with: {rehearse_command_line(asked.scene, asked.out, asked.probe)}"
+        f"rehearse the first in a window with: {rehearse_command_line(asked)}"
     )
 
 
@@ -175,20 +169,8 @@ def table_of(proposals: list["Proposal"]) -> str:
     return tabulate(rows, heads, floatfmt=".1f", missingval=NOT_LABELLED)
 
 
-def rehearse_command_line(scene: Path, plan_file: Path, probe: str | None) -> str:
+def rehearse_command_line(asked: PlanOptions) -> str:
     """The command line that follows a plan, with the same probe."""
-    scene_argument = [] if scene == EMBEDDED else [scene]
-    probe_option = [] if probe is None else ["--probe", probe]
-    return shell_command("rehearse", *scene_argument, *probe_option, "--plan", plan_file)
-
-
-def trocar_of(scenes: Trocar, asked: PlanOptions) -> Trocar:
-    """The scene's trocar with the options of the command line. Raises CommandError."""
-    given = {"at_mm": asked.trocar, "cone_deg": asked.cone_deg, "wrist_deg": asked.wrist_deg}
-    values = scenes.model_dump() | {name: value for name, value in given.items() if value is not None}
-    try:
-        return Trocar.model_validate(values)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        option = str(first["loc"][0]).replace("at_mm", "trocar").replace("_", "-")
-        raise CommandError(f"--{option} = {first['input']!r}: {first['msg'].lower()}") from None
+    scene = [] if asked.scene == EMBEDDED else [asked.scene]
+    probe = asked.changes.get("transducer.probe")
+    return shell_command("rehearse", *scene, *(["--probe", probe] if probe else []), "--plan", asked.out)

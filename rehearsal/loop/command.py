@@ -10,8 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, InstanceOf, PlainSerializer
 
-from rehearsal.loop.history import History
-from rehearsal.loop.state import WholeState
+from rehearsal.loop.state import History, WholeState
 from rehearsal.resection.resection_state import MOST_MARKS
 from render.viewer import Technique
 from settings import Value

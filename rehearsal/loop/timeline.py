@@ -40,8 +40,7 @@ from rehearsal.loop.frame import (
     Step,
     whole_geometry,
 )
-from rehearsal.loop.history import History
-from rehearsal.loop.state import WholeState
+from rehearsal.loop.state import History, WholeState
 from rehearsal.pressed_organ import PressedOrgan
 from rehearsal.resection.cut import Cut, CutSettings, check_hilum, cut_organ, hilum_of, part_left
 from rehearsal.resection.resection_state import NO_RESECTION, CutRequest, Resection

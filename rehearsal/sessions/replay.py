@@ -13,9 +13,8 @@ from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.live_settings import LiveSettings, with_recorded
 from rehearsal.loop.command import Bookmark, Checkpoint, Command, Load, SetValues
 from rehearsal.loop.frame import Digest, Frame, Refused
-from rehearsal.loop.history import History
 from rehearsal.loop.protocols import Observer, Stepper
-from rehearsal.loop.state import WholeState
+from rehearsal.loop.state import History, WholeState
 from rehearsal.loop.timeline import SETTLED
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.notices import Notices

@@ -30,7 +30,7 @@ from rehearsal.loop.command import (
     Undo,
     are_rigid,
 )
-from rehearsal.loop.history import History
+from rehearsal.loop.state import History
 from rehearsal.loop.timeline import SETTLED
 from rehearsal.sessions.packed_arrays import Seen, SeenVoxels, unpack_lengths, unpack_poses
 from scenes.scene import Scene

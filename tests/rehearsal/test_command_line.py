@@ -7,7 +7,7 @@ import pytest
 
 from errors import PatientError
 from rehearsal.commands.command_line import CommandError, load_patient, make_folder, save_figures
-from rehearsal.commands.plan_command import rehearse_command_line
+from rehearsal.commands.plan_command import PlanOptions, rehearse_command_line
 from scenes.atomic_files import check_folder
 from scenes.scene import EMBEDDED
 from scenes.terminal import shell_command
@@ -45,9 +45,9 @@ def test_a_command_to_be_pasted_is_quoted_as_its_shell_needs_it(monkeypatch, sys
     [(EMBEDDED, None, []), (Path("a b"), "linear", ["a b", "--probe", "linear"])],
 )
 def test_what_follows_a_plan_names_its_scene_and_probe(scene, probe, words):
-    assert rehearse_command_line(scene, Path("plan.json"), probe) == shell_command(
-        "rehearse", *words, "--plan", "plan.json"
-    )
+    changes = {"transducer.probe": probe} if probe else {}
+    asked = PlanOptions(scene=scene, out=Path("plan.json"), changes=changes)
+    assert rehearse_command_line(asked) == shell_command("rehearse", *words, "--plan", "plan.json")
 
 
 def test_figures_that_cannot_be_written_say_so(tmp_path, capsys):

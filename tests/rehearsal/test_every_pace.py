@@ -17,7 +17,7 @@ from settings_at_start import settings_with
 from rehearsal import run
 from rehearsal.asked_files import AskedFiles
 from rehearsal.commands.rehearse_options import RehearseOptions
-from rehearsal.live_settings import DEFAULT_KEYS, initial_settings
+from rehearsal.live_settings import DEFAULT_KEYS, LiveSettings, initial_settings
 from rehearsal.loop.command import Move
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.notices import Notices
@@ -30,7 +30,7 @@ from rehearsal.real_time.started_process import start_process
 from rehearsal.rehearsal import Rehearsal, begin
 from rehearsal.sessions.replay import Replay, ReplayCheck
 from rehearsal.sessions.session_file import Log, read_log
-from render.viewer import Controls, Settings
+from render.viewer import Controls
 from scenes.anatomy import LoadedAnatomy, fingerprint
 from sim.device import start
 from ultrasound.probe_manipulator import advanced
@@ -87,7 +87,7 @@ SCRIPT = (
 PART_S, PART_FRAMES = 0.15, 4
 
 
-def everything(rehearsal: Rehearsal, settings: Settings) -> Iterator[Controls]:
+def everything(rehearsal: Rehearsal, settings: LiveSettings) -> Iterator[Controls]:
     """The controls of each frame of the script."""
     home = rehearsal.manipulator.home
     down = home[:3, 3] + 60.0 * home[:3, 2], -home[:3, 2]

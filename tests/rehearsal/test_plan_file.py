@@ -2,7 +2,6 @@
 
 import json
 from contextlib import nullcontext
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from pydantic import ValidationError
 
 import app
 from rehearsal.asked_files import check_plan, check_reach
-from rehearsal.commands.plan_command import PlanOptions, over_limit_warning, trocar_of
+from rehearsal.commands.plan_command import over_limit_warning
 from rehearsal.planning import trial_workers
 from rehearsal.planning.plan_file import (
     APPROACH_S,
@@ -28,7 +27,7 @@ from rehearsal.planning.plan_file import (
 )
 from rehearsal.planning.sweep_trial import PlanningProblem
 from rehearsal.tracking.track_file import load_track
-from scenes.scene import Trocar
+from scenes.scene import AnatomyFiles, Scene, Trocar, with_options
 from ultrasound.probe import load_probe
 
 BALL = """
@@ -220,11 +219,10 @@ def test_a_trocar_out_of_range_is_refused(values):
 
 
 def test_the_command_line_changes_the_scenes_trocar():
-    scenes = Trocar(at_mm=(1, 2, 3), axis=(0, 0, 2), cone_deg=40, wrist_deg=60, longest_mm=200)
-    assert trocar_of(scenes, PlanOptions(out=Path("plan.json"))) == scenes
-    changed = trocar_of(
-        scenes, PlanOptions(out=Path("plan.json"), trocar=(4, 5, 6), cone_deg=30, wrist_deg=0)
-    )
+    trocar = Trocar(at_mm=(1, 2, 3), axis=(0, 0, 2), cone_deg=40, wrist_deg=60, longest_mm=200)
+    scene = Scene(anatomy=AnatomyFiles(), trocar=trocar)
+    options = {"trocar.at_mm": (4.0, 5.0, 6.0), "trocar.cone_deg": 30.0, "trocar.wrist_deg": 0.0}
+    changed = with_options(scene, options).trocar
     assert changed == Trocar(at_mm=(4, 5, 6), axis=(0, 0, 2), cone_deg=30, wrist_deg=0, longest_mm=200)
 
 

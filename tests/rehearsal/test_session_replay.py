@@ -27,7 +27,7 @@ from rehearsal.sessions.replay import Replay, open_session
 from rehearsal.sessions.session_file import Header, Log, SessionError, makes_state, read_log
 from rehearsal.tracking.pose_file import TimedPoses
 from rehearsal.window_loop import PREPARING
-from render.viewer import Controls, Settings, View
+from render.viewer import Controls, View
 from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy
 from settings import with_values
@@ -40,7 +40,7 @@ from version import VERSION
 class Watched(NullViewer):
     """A window that draws nothing. ``seen`` is what each view of its frames shows."""
 
-    def __init__(self, settings: Settings, script: Any) -> None:
+    def __init__(self, settings: LiveSettings, script: Any) -> None:
         super().__init__(settings, script)
         self.seen: list[tuple] = []
         self.now_s = 0.0

@@ -28,7 +28,7 @@ from rehearsal.loop.command import (
     Undo,
 )
 from rehearsal.loop.frame import Applied, Digest, Refused, Step
-from rehearsal.loop.history import MOST_UNDONE, History
+from rehearsal.loop.state import MOST_UNDONE, History
 from rehearsal.loop.timeline import SETTLED, Timeline
 from rehearsal.notices import Notices
 from rehearsal.sessions.recorder import SessionRecorder
@@ -227,7 +227,7 @@ def test_iterations_are_recorded_as_they_were_and_not_as_they_are_set():
     for iterations in (None, 2, 2, None):
         timeline.step(pose_at(1.0), iterations=iterations)
     values = [event.command.values for event in timeline.newest().events if isinstance(event, Applied)]
-    assert values == [{"iterations": 2}, {"iterations": 4}]
+    assert values == [{"solver.iterations": 2}, {"solver.iterations": 4}]
 
 
 def test_each_second_has_a_digest_and_each_way_back():

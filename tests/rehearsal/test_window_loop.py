@@ -29,10 +29,11 @@ from rehearsal.loop.frame import Frame, Step
 from rehearsal.notices import Notices
 from rehearsal.window_loop import PREPARING, WindowLoop
 from rehearsal.window_panel import WindowPanel
-from render.viewer import Controls, Settings, View
+from render.viewer import Controls, View, ViewSettings
 from render.window import NoVulkan
 from scenes.scene import EMBEDDED, SceneError, load_scene
 from scenes.terminal import shell_command
+from settings import with_values
 from ultrasound.probe import load_probe
 
 FILES = AskedFiles(Path(), load_scene(EMBEDDED), load_probe("linear"), DEFAULT_KEYS)
@@ -84,7 +85,7 @@ class FakeMeasurements:
     def observe(self, frame: Frame, probe) -> None:
         self.observed.append((frame.number, probe.depth_mm))
 
-    def onto(self, view: View, settings: Settings) -> View:
+    def onto(self, view: View, shown: ViewSettings) -> View:
         return replace(view, **self.alert)
 
     def figures(self) -> dict:
@@ -106,12 +107,12 @@ class OneMove:
         return [] if controls.frozen else [*also, Move(pose=pose)]
 
 
-def grey_view(anatomy: FakeAnatomy, probe, settings, ms=None, shape=None, persistence=None) -> View:
+def grey_view(anatomy: FakeAnatomy, settings, ms=None, shape=None, persistence=None) -> View:
     """Images as bright as the number of the frame, at its pose."""
     grey = np.full(shape or (4, 4), anatomy.frame.number % 256, np.uint8)
     if ms is not None:
         ms.append(1.0)
-    width, depth, _ = probe.extent_mm
+    width, depth, _ = settings.probe.extent_mm
     return View(anatomy.pose, {"B-mode": grey, "CT": 255 - grey}, width, depth)
 
 
@@ -215,9 +216,14 @@ def test_the_first_image_of_a_new_kind_is_announced_over_the_last_one(looping):
     looping.next()
     settings = looping.viewer.settings
     drawn = []
-    for change in ({}, dict(mode="ct"), {}, dict(doppler="colour"), dict(compounding=True)):
-        for name, value in change.items():
-            setattr(settings, name, value)
+    for change in (
+        {},
+        {"image.mode": "ct"},
+        {},
+        {"scanner.doppler": "colour"},
+        {"probe.compound_angles": 3},
+    ):
+        settings = with_values(settings, change)
         looping.drawn.clear()
         looping.loop._announce_new_kind(View(np.eye(4), {}, 1.0, 1.0), settings)
         drawn.append([view.status for view in looping.drawn])
