@@ -141,7 +141,7 @@ def explained(
         text = message if message.startswith(name) else f"{name}: {message}"
     else:
         text = f"{f'{name} = ' if name else ''}{FOUND.repr(first['input'])}: {message}"
-    more = list(dict.fromkeys(each for each in names if each != name))
+    more = list(dict.fromkeys(other for other in names if other != name))
     others = ", ".join(more[:MOST_NAMED]) + (", ..." if len(more) > MOST_NAMED else "")
     return text + (f" (and {len(more)} more: {others})" if more else "")
 

@@ -63,8 +63,12 @@ def step_settings(tissue: TissueSection, section: SolverSection) -> StepSettings
     """The settings of a step: the scene's, else the tissue model's, else the paper's."""
     names = {field.name for field in fields(StepSettings)}
     own = {name: value for name, value in tissue.model_dump().items() if name in names}
-    given = {name: value for name, value in section.model_dump(exclude_none=True).items() if name in names}
-    return replace(StepSettings(damping=section.damping_per_s), **(own | dict(tissue.step_defaults) | given))
+    of_section = {
+        name: value for name, value in section.model_dump(exclude_none=True).items() if name in names
+    }
+    return replace(
+        StepSettings(damping=section.damping_per_s), **(own | dict(tissue.step_defaults) | of_section)
+    )
 
 
 def build_solver(

@@ -39,11 +39,11 @@ class Caliper:
         if len(self.points) < 2:
             return ""
         start, end = np.array(self.points)
-        found = f"{np.linalg.norm(end - start):.1f} mm"
+        text = f"{np.linalg.norm(end - start):.1f} mm"
         if frame.rest is not None:
             places = at_rest(frame.rest, np.array(self.points), frame.view)
-            found += f"\nat rest {np.linalg.norm(places[1] - places[0]):.1f} mm"
-        return found
+            text += f"\nat rest {np.linalg.norm(places[1] - places[0]):.1f} mm"
+        return text
 
 
 def at_rest(rest: np.ndarray, points_mm: np.ndarray, view: View) -> np.ndarray:

@@ -123,15 +123,15 @@ def choose_setup(model: str, quality: str, **changes: Any) -> Setup:
 def probe_of(scene: Scene) -> Probe:
     """The probe that a scene names, with the scene's depth and housing if it has them. Raises ProbeError."""
     own = {"depth_mm": scene.image.depth_mm, "housing_mm": scene.transducer.size_mm}
-    given = {key: value for key, value in own.items() if value is not None}
+    changes = {key: value for key, value in own.items() if value is not None}
     probe = load_probe(scene.transducer.probe)
     try:
-        return changed_probe(probe, **given)
+        return changed_probe(probe, **changes)
     except ProbeError as error:
         keys = {"depth_mm": "image.depth_mm", "housing_mm": "transducer.size_mm"}
         values = " and ".join(
             f"{keys[key]} = {list(value) if isinstance(value, tuple) else value}"
-            for key, value in given.items()
+            for key, value in changes.items()
         )
         raise ProbeError(
             f"{values} does not fit the probe {probe.transducer_name}: {error}; change it, or leave it out"

@@ -71,8 +71,8 @@ class DeformedAnatomy:
         self.scanner: Scanner | None = None
         if scanned is not None:
             around = image.outside, image.contact, image.coupling_gap_mm
-            given = scanned.anatomy, self.embedding, case.probe, image.pixels, *around, scanned.acoustics
-            self.scanner = Scanner(*given)
+            inputs = scanned.anatomy, self.embedding, case.probe, image.pixels, *around, scanned.acoustics
+            self.scanner = Scanner(*inputs)
 
     def show(self, frame: Frame) -> None:
         """Take over a frame: move the surfaces, and have those of its geometry where it is another one."""
@@ -237,9 +237,9 @@ class DeformedAnatomy:
             as_cut = Carried(*(self.carried_then(surface.vertices) for surface in surfaces))
             labels, tissues = self._labels
             moved = labels and Grid(labels.voxels, labels.index_from_mm @ shift_by(self.case.origin))
-            given = cut, self.case.organ, tumour, self.case.parts, as_cut, moved, tissues
+            inputs = cut, self.case.organ, tumour, self.case.parts, as_cut, moved, tissues
             try:
-                self._judged = resection, judge(*given), ""
+                self._judged = resection, judge(*inputs), ""
             except PatientError as error:
                 self._judged = resection, None, f"no figures of the cut: {error}"
         return self._judged[1:]
@@ -282,5 +282,5 @@ def scanned_anatomy(
     label_values = None if labels is None else labels.voxels.astype(np.int32)
     tumour = anatomy.tumour and translated(anatomy.tumour, -origin)
     classify = None if labels is None else partial(tissue_voxels, labels, anatomy, ct, draws, origin)
-    given = organ, ct.voxels, ct.index_from_mm @ shift, label_values, anatomy.tissues, tumour
-    return ScannedAnatomy(*given, classify)
+    inputs = organ, ct.voxels, ct.index_from_mm @ shift, label_values, anatomy.tissues, tumour
+    return ScannedAnatomy(*inputs, classify)

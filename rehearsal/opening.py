@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 import click
 import numpy as np
 
-from rehearsal.asked_files import AskedFiles, check_anatomy, read_files
 from rehearsal.case import Case, case_of
 from rehearsal.commands.command_line import CommandError, make_folder, start_taichi
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.configuration import Setup, scene_of
+from rehearsal.input_files import InputFiles, check_anatomy, read_files
 from rehearsal.real_time.pace import Pace
 from rehearsal.real_time.start_times import StartTimes
 from rehearsal.real_time.started_process import StartedProcess
@@ -40,14 +40,14 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def opened(asked: RehearseOptions, process: StartedProcess | None) -> Iterator["RehearsalRun"]:
+def opened(options: RehearseOptions, process: StartedProcess | None) -> Iterator["RehearsalRun"]:
     """The rehearsal that the user asks for, in a window with the process for its solver.
 
     Raises UserError, CommandError.
     """
     start = StartTimes()
     start.begin("Files")
-    files = read_files(asked)
+    files = read_files(options)
     for warning in warning_lines(files.warnings, files.folder):
         click.echo(warning)
     for text in files.acknowledged:
@@ -57,15 +57,15 @@ def opened(asked: RehearseOptions, process: StartedProcess | None) -> Iterator["
         solver = None if process is None else resources.enter_context(solver_process(process))
         if solver is not None:
             check_graphics()
-        make_folder(asked.out)
-        arch = start_taichi(asked.arch)
-        link = open_link(asked)
+        make_folder(options.out)
+        arch = start_taichi(options.arch)
+        link = open_link(options)
         start.begin("Window")
         # A budget is met by trials, and each starts Taichi anew, which would end a window.
-        has_trials = asked.budget_ms is not None or asked.error_mm is not None
+        has_trials = options.budget_ms is not None or options.error_mm is not None
         viewer = None
-        if not (asked.headless or has_trials):
-            viewer = resources.enter_context(window(asked, files.keys))
+        if not (options.headless or has_trials):
+            viewer = resources.enter_context(window(options, files.keys))
         with stages() as line:
 
             def progress(stage: str) -> None:
@@ -76,21 +76,21 @@ def opened(asked: RehearseOptions, process: StartedProcess | None) -> Iterator["
 
             progress("Anatomy")
             anatomy = load_anatomy(files.scene, files.folder, progress)
-            check_anatomy(files, asked, anatomy)
+            check_anatomy(files, options, anatomy)
             began, scene, chosen = perf_counter(), files.scene, ""
             if has_trials:
-                scene, chosen = scene_within_budget(files, anatomy, arch, progress, asked)
-                if not asked.headless:
-                    viewer = resources.enter_context(window(asked, files.keys))
+                scene, chosen = scene_within_budget(files, anatomy, arch, progress, options)
+                if not options.headless:
+                    viewer = resources.enter_context(window(options, files.keys))
             # A session of this backend is replayed as it was recorded, on however many cores.
             serial = files.log.header.serial if files.log and files.log.header.arch == arch else None
             case = case_of(scene, anatomy, files.probe)
             if solver is None or viewer is None:
-                built = built_headless(asked, case, anatomy, serial, progress)
+                built = built_headless(options, case, anatomy, serial, progress)
             else:
-                built = built_for_window(asked, case, anatomy, serial, arch, solver, viewer, progress)
+                built = built_for_window(options, case, anatomy, serial, arch, solver, viewer, progress)
             build_s = perf_counter() - began
-            if solver is None and not asked.no_pictures:
+            if solver is None and not options.no_pictures:
                 progress("Building the model: the first picture")
                 compile_picture(built.anatomy)
         # All this lives as long as the rehearsal: to look for garbage in it would delay single frames by a
@@ -104,7 +104,7 @@ def opened(asked: RehearseOptions, process: StartedProcess | None) -> Iterator["
             click.echo(chosen)
         from rehearsal.run import RehearsalRun
 
-        yield RehearsalRun(built, anatomy, arch, asked, files, viewer, link, build_s, start)
+        yield RehearsalRun(built, anatomy, arch, options, files, viewer, link, build_s, start)
 
 
 @contextmanager
@@ -120,11 +120,11 @@ def solver_process(started: StartedProcess) -> Iterator["SolverProcess"]:
 
 
 @contextmanager
-def window(asked: RehearseOptions, keys: Keys) -> Iterator["Window[LiveSettings]"]:
+def window(options: RehearseOptions, keys: Keys) -> Iterator["Window[LiveSettings]"]:
     """An open window that shows progress. Raises CommandError."""
     from render.window import NoVulkan, Window
 
-    pad = Gamepad(SdlPads(), keys.buttons) if asked.gamepad else None
+    pad = Gamepad(SdlPads(), keys.buttons) if options.gamepad else None
     try:
         opened: Window[LiveSettings] = Window(size=window_size(), keys=keys, gamepad=pad)
     except NoVulkan as reason:
@@ -136,7 +136,7 @@ def window(asked: RehearseOptions, keys: Keys) -> Iterator["Window[LiveSettings]
 
 
 def built_headless(
-    asked: RehearseOptions,
+    options: RehearseOptions,
     case: Case,
     anatomy: LoadedAnatomy,
     serial: bool | None,
@@ -146,7 +146,7 @@ def built_headless(
     from rehearsal.rehearsal import Rehearsal
     from rehearsal.run import Built
 
-    needs_b_mode = case.scene.image.mode != "ct" and not asked.no_pictures
+    needs_b_mode = case.scene.image.mode != "ct" and not options.no_pictures
     rehearsal = Rehearsal(case, anatomy, progress, needs_b_mode, serial)
     model = rehearsal.organ.model
     shown = rehearsal.anatomy, rehearsal.timeline, rehearsal.manipulator
@@ -154,7 +154,7 @@ def built_headless(
 
 
 def built_for_window(
-    asked: RehearseOptions,
+    options: RehearseOptions,
     case: Case,
     anatomy: LoadedAnatomy,
     serial: bool | None,
@@ -175,8 +175,8 @@ def built_for_window(
     from rehearsal.rehearsal import begin
     from rehearsal.run import Built
 
-    time_step_s = case.scene.solver.time_step_s if asked.rate is None else 1.0 / asked.rate
-    pace = Pace(time_step_s, asked.budget_ms or np.inf)
+    time_step_s = case.scene.solver.time_step_s if options.rate is None else 1.0 / options.rate
+    pace = Pace(time_step_s, options.budget_ms or np.inf)
     solver.build(SolverSetup(case, arch, pace, serial))
     scanned = scanned_ct(case, anatomy, case.scene.image.mode != "ct")
     progress("Building the model: tissue and contacts")
@@ -220,7 +220,7 @@ def compile_picture(anatomy: "DeformedAnatomy") -> "View":
 
 
 def scene_within_budget(
-    files: AskedFiles, anatomy: LoadedAnatomy, arch: str, progress: ReportProgress, asked: RehearseOptions
+    files: InputFiles, anatomy: LoadedAnatomy, arch: str, progress: ReportProgress, options: RehearseOptions
 ) -> tuple[Scene, str]:
     """The scene with the settings that meet the budgets on this machine, and a text that names them.
 
@@ -233,8 +233,8 @@ def scene_within_budget(
         start_taichi(arch)
         return Rehearsal(case_of(scene_of(files.scene, setup), anatomy, files.probe), anatomy, progress)
 
-    front = front_of(load_points(), asked.changes.get("tissue.model"))
-    _, point, step_ms = choose_within_budget(front, build, asked.budget_ms, asked.error_mm)
+    front = front_of(load_points(), options.changes.get("tissue.model"))
+    _, point, step_ms = choose_within_budget(front, build, options.budget_ms, options.error_mm)
     start_taichi(arch)
     text = (
         f"Chosen: {described(point.setup)}; a step takes {step_ms:.1f} ms here, expected error "

@@ -105,15 +105,15 @@ class PoseScans:
     def save(self, name: str, images: dict[str, np.ndarray], dicom: bool) -> None:
         """Write the last pose's images by their names, and note them in ``rows``. Raises OSError."""
         prefix = self.out / name
-        for each in save_images(images, *self.probe.extent_mm[:2], self.probe, prefix, dicom):
+        for saved in save_images(images, *self.probe.extent_mm[:2], self.probe, prefix, dicom):
             self.rows.append(
                 dict(
                     pose=name,
                     probe_to_patient=self._planes[-1].world_from_plane.tolist(),
-                    picture=each.kind,
-                    file=each.path.name,
-                    row_mm=each.spacing_mm[0],
-                    column_mm=each.spacing_mm[1],
-                    image_to_probe=self.probe.image_to_probe(*each.shape).tolist(),
+                    picture=saved.kind,
+                    file=saved.path.name,
+                    row_mm=saved.spacing_mm[0],
+                    column_mm=saved.spacing_mm[1],
+                    image_to_probe=self.probe.image_to_probe(*saved.shape).tolist(),
                 )
             )

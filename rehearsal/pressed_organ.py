@@ -302,12 +302,12 @@ def parts_of(case: Case) -> list[Part]:
     return parts
 
 
-def material_of(name: str, given: PartMaterial) -> Material:
+def material_of(name: str, own: PartMaterial) -> Material:
     """The material of a part: what is given, and what is typical of it."""
     typical = mechanical_properties().parts[name]
     return Material(
         *(
-            getattr(typical, key)[1] if getattr(given, key) is None else getattr(given, key)
+            getattr(typical, key)[1] if getattr(own, key) is None else getattr(own, key)
             for key in ("young_kpa", "poisson", "density_g_cm3")
         )
     )

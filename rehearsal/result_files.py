@@ -36,7 +36,7 @@ def next_number(folder: Path, pattern: str) -> int:
     """One more than the highest number in a folder's file names that match a pattern in full; the number
     is its first group.
     """
-    numbers = [int(found[1]) for path in folder.glob("*") if (found := re.fullmatch(pattern, path.name))]
+    numbers = [int(matched[1]) for path in folder.glob("*") if (matched := re.fullmatch(pattern, path.name))]
     return 1 + max(numbers, default=0)
 
 

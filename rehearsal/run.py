@@ -11,11 +11,11 @@ import numpy as np
 from click.exceptions import Exit
 
 from rehearsal.announcements import Announcements
-from rehearsal.asked_files import AskedFiles
 from rehearsal.commands.command_line import STOPPED, CommandError
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.headless import HeadlessLoop, run_headless
+from rehearsal.input_files import InputFiles
 from rehearsal.live_settings import LiveSettings, initial_settings
 from rehearsal.loop.command import Checkpoint
 from rehearsal.loop.frame import Checkpointed, Frame
@@ -82,8 +82,8 @@ class RehearsalRun:
     built: Built
     loaded: LoadedAnatomy
     arch: str
-    asked: RehearseOptions
-    files: AskedFiles
+    options: RehearseOptions
+    files: InputFiles
     viewer: Window[LiveSettings] | None = None
     link: OpenIGTLinkServer | None = None
     build_s: float = 0.0
@@ -115,7 +115,7 @@ class RehearsalRun:
         )
         click.echo(self.files.keys.worded(text))
         announcements = Announcements(self.anatomy, self.notices)
-        plans = PlanControl(self.anatomy.case, self.loaded, self.measurements, self.asked.out, self.notices)
+        plans = PlanControl(self.anatomy.case, self.loaded, self.measurements, self.options.out, self.notices)
         panel = WindowPanel(
             self.anatomy,
             source,
@@ -124,7 +124,7 @@ class RehearsalRun:
             self.resection,
             plans,
             self.notices,
-            self.asked.out,
+            self.options.out,
             self.files.keys,
             self.built.counts,
             self.link,
@@ -176,8 +176,8 @@ class RehearsalRun:
             self.files.warnings,
         )
         with self._summarised(check):
-            draws, about = not self.asked.no_pictures, self._about_patient()
-            run_headless(loop, steps, self.arch, self.asked.out, draws, self.files.resection_plan, about)
+            draws, about = not self.options.no_pictures, self._about_patient()
+            run_headless(loop, steps, self.arch, self.options.out, draws, self.files.resection_plan, about)
 
     def _observers(self, announcements: Announcements, check: ReplayCheck | None) -> list[Observer]:
         """Those of each frame, in this order: beside a whole state the coverage is recorded, with the
@@ -201,21 +201,21 @@ class RehearsalRun:
         last = len(replay.log.commands)
         if replay.place == last:
             raise CommandError(
-                f"the session has nothing after {self.asked.at:g} s: it is {replay.log.length_s:.1f} s long"
+                f"the session has nothing after {self.options.at:g} s: it is {replay.log.length_s:.1f} s long"
             )
-        if self.asked.seconds is not None:
-            last = max(replay.log.place_at(replay.time_s + self.asked.seconds), replay.place + 1)
+        if self.options.seconds is not None:
+            last = max(replay.log.place_at(replay.time_s + self.options.seconds), replay.place + 1)
         return max(1, replay.frames_until(last))
 
     def _tracked(self, track: TimedPoses) -> tuple[Source, int]:
-        length_s = min(self.asked.seconds or np.inf, track.length_s)
+        length_s = min(self.options.seconds or np.inf, track.length_s)
         # One step at 0 s and one at the end.
         return self._user(), 1 + int(length_s / self._step_s + 1e-9)
 
     def _scripted(self) -> tuple[Source, int]:
         case, manipulator = self.anatomy.case, self.manipulator
         length_s = script_length_s(case)
-        steps = max(1, round((self.asked.seconds or length_s) / self._step_s))
+        steps = max(1, round((self.options.seconds or length_s) / self._step_s))
 
         def next_pose(share: float, pose: np.ndarray) -> np.ndarray:
             goal = scripted_pose(case, manipulator, length_s * share)
@@ -233,7 +233,7 @@ class RehearsalRun:
         if track is not None:
             tracker = Tracker(partial(played_pose, track), case)
             script = ResectionScript(list(track.actions))
-        elif self.link is not None and self.asked.link_leads:
+        elif self.link is not None and self.options.link_leads:
             received = self.link.received_pose
             tracker = Tracker(lambda time_s: received.pose(), case)
         return UserSource(
@@ -264,7 +264,7 @@ class RehearsalRun:
         _echo(replay_warning(replay.log.header, self.arch))
         observers: list[Observer] = [self.measurements] if check is None else [self.measurements, check]
         return open_session(
-            replay, self.asked.at, self.built.stepper, self.anatomy, settings, self.measurements, observers
+            replay, self.options.at, self.built.stepper, self.anatomy, settings, self.measurements, observers
         )
 
     @contextmanager
@@ -285,7 +285,7 @@ class RehearsalRun:
 
         click.echo("\n".join(f"{name:<21}  {value}" for name, value in rows_of(report)))
         try:
-            click.echo("Saved " + " and ".join(map(str, save_page(self.anatomy, report, self.asked.out))))
+            click.echo("Saved " + " and ".join(map(str, save_page(self.anatomy, report, self.options.out))))
         except OSError as error:
             click.echo(f"Warning: the page of the resection is not saved: {error.strerror}")
 
@@ -318,7 +318,7 @@ class RehearsalRun:
         if report is not None:
             self._save_page(report)
         if recorder is not None:
-            scene = [] if self.asked.scene == EMBEDDED else [self.asked.scene]
+            scene = [] if self.options.scene == EMBEDDED else [self.options.scene]
             again = shell_command("rehearse", *scene, "--replay", recorder.path)
             click.echo(recorder.fault or f"Recorded; replay it with: {again}")
 
@@ -362,7 +362,7 @@ class Recording:
         )
         try:
             self.recorder = SessionRecorder(
-                next_path(run.asked.out),
+                next_path(run.options.out),
                 header,
                 run.notices,
                 lambda: pack_seen(run.measurements.coverage.seen),
@@ -370,7 +370,7 @@ class Recording:
         except OSError as error:
             self.recorder = None
             click.echo(
-                f"Warning: this session is not recorded: {run.asked.out} cannot be written to "
+                f"Warning: this session is not recorded: {run.options.out} cannot be written to "
                 f"({error.strerror})"
             )
         run.measurements.note = self._note

@@ -45,14 +45,14 @@ class Point:
 def load_points() -> tuple[Point, ...]:
     """The measured points, fastest first."""
     rows = json.loads(MEASURED.read_text("utf-8"))["points"]
-    found = [Point(setup_of_row(row), row["ms_median"], row["error_mean_mm"], row["pareto"]) for row in rows]
-    return tuple(sorted(found, key=lambda point: point.ms_median))
+    points = [Point(setup_of_row(row), row["ms_median"], row["error_mean_mm"], row["pareto"]) for row in rows]
+    return tuple(sorted(points, key=lambda point: point.ms_median))
 
 
 def setup_of_row(row: dict[str, Any]) -> Setup:
     """The settings of a row of trade.json."""
-    given = {name: row[name] for name in SETTINGS if row[name] is not None}
-    return setup_of(row["model"], **given)
+    values = {name: row[name] for name in SETTINGS if row[name] is not None}
+    return setup_of(row["model"], **values)
 
 
 def preset_of(setup: Setup) -> str:

@@ -17,11 +17,11 @@ def tissue_voxels(
 
     ``draws``: also what no CT shows.
     """
-    found = stored_tissue_map(labels, anatomy, ct, draws)
+    tissues_of_ct = stored_tissue_map(labels, anatomy, ct, draws)
     shift = np.eye(4)
     shift[:3, 3] = origin
     tissues = {code: name for name, code in CODE.items()}
-    return TissueVoxels(found.hu, found.codes, tissues, found.index_from_mm @ shift)
+    return TissueVoxels(tissues_of_ct.hu, tissues_of_ct.codes, tissues, tissues_of_ct.index_from_mm @ shift)
 
 
 def stored_tissue_map(labels: Grid, anatomy: LoadedAnatomy, ct: Grid, draws: bool) -> TissueMap:
@@ -31,8 +31,10 @@ def stored_tissue_map(labels: Grid, anatomy: LoadedAnatomy, ct: Grid, draws: boo
     """
     check_tissues(anatomy.tissues | anatomy.corrected_tissues)
     codes = codes_of_labels(labels.voxels, anatomy.tissues)
-    found = TissueMap(*stored(tissue_arrays, ct.voxels, codes, anatomy.organ, ct.index_from_mm, int(draws)))
+    classified = TissueMap(
+        *stored(tissue_arrays, ct.voxels, codes, anatomy.organ, ct.index_from_mm, int(draws))
+    )
     own = anatomy.corrections
     if own is None:
-        return found
-    return with_corrections(found, own.voxels, own.index_from_mm, anatomy.corrected_tissues)
+        return classified
+    return with_corrections(classified, own.voxels, own.index_from_mm, anatomy.corrected_tissues)

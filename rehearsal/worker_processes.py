@@ -71,13 +71,13 @@ class Workers:
         for number, future in self.completed(function, tasks):
             done[number] = future
             while due in done:
-                found = done.pop(due)
-                if has_ended(error_of(found)):
+                future = done.pop(due)
+                if has_ended(error_of(future)):
                     raise WorkerError(
                         "a worker process was ended, perhaps for lack of memory; close other programs, or "
                         "give fewer --jobs"
                     )
-                yield found.result()
+                yield future.result()
                 due += 1
 
     def completed(self, function: Callable[..., T], tasks: Iterable[tuple]) -> Iterator[tuple[int, Future]]:
@@ -219,6 +219,6 @@ def end_with_parent(parent: int) -> None:
 def _watch(parent: int) -> None:
     # An orphan has another parent, or none. The id of a killed parent may still exist, until somebody waits
     # for it.
-    while (found := psutil.Process().parent()) is not None and found.pid == parent:
+    while (process := psutil.Process().parent()) is not None and process.pid == parent:
         time.sleep(WATCH_S)
     os._exit(1)

@@ -74,7 +74,7 @@ def make_folder(folder: Path, option: str = "--out") -> None:
 
     If the command ends without output, the folder is removed.
     """
-    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    made = [missing for missing in (folder, *folder.parents) if not missing.exists()]
     if context := click.get_current_context(silent=True):
         context.call_on_close(partial(_remove_empty, made))
     fault = "created"
@@ -91,8 +91,8 @@ def make_folder(folder: Path, option: str = "--out") -> None:
 def _remove_empty(folders: list[Path]) -> None:
     """Remove folders, each within the next, while they are empty."""
     with suppress(OSError):
-        for each in folders:
-            each.rmdir()
+        for folder in folders:
+            folder.rmdir()
 
 
 def make_place(file: Path | None, option: str = "--json") -> None:
@@ -178,7 +178,7 @@ class CommandOptions(BaseModel):
     changes: dict[str, Any] = {}
     """The values of a scene that options change, by path."""
 
-    def given(self, *names: str) -> list[str]:
+    def set_by_user(self, *names: str) -> list[str]:
         """Those options among some fields and settings of a scene that the user gave, as the user names
         them.
         """
@@ -243,7 +243,7 @@ def _kind_of(field: FieldInfo) -> Any:
 def _parameter(name: str, field: FieldInfo) -> click.Parameter:
     kind = _kind_of(field)
     items = get_args(kind) if get_origin(kind) is tuple else (kind,)
-    marks = [each for each in field.metadata if isinstance(each, str)]
+    marks = [mark for mark in field.metadata if isinstance(mark, str)]
     common: dict[str, Any] = dict(
         type=_click_type(items[0], field.metadata),
         nargs=-1 if Ellipsis in items else len(items),
@@ -265,7 +265,7 @@ def _click_type(kind: Any, about: list[Any]) -> click.ParamType:
             return choice
     if get_origin(kind) is Literal:
         return click.Choice(get_args(kind))
-    bounds = {each: getattr(bound, each) for bound in about for each in BOUNDS if hasattr(bound, each)}
+    bounds = {end: getattr(bound, end) for bound in about for end in BOUNDS if hasattr(bound, end)}
     if bounds:
         low, high = bounds.get("ge", bounds.get("gt")), bounds.get("le", bounds.get("lt"))
         range_of = WholeRange if kind is int else NumberRange

@@ -29,7 +29,7 @@ class ExportOptions(CommandOptions):
 
 
 @command(ExportOptions)
-def export(asked: ExportOptions) -> None:
+def export(options: ExportOptions) -> None:
     """Write surfaces, CT and labels of SCENE as files.
 
     SCENE is a scene file or a patient's folder. Surfaces become STL or PLY, CT and label map NRRD.
@@ -37,7 +37,7 @@ def export(asked: ExportOptions) -> None:
     corrected there, it is given to import beside the labels.
     All is in mm, in the patient's LPS, at rest; rehearse writes the deformed surfaces.
     """
-    path, out, suffix = scene_file(asked.scene), asked.out, asked.suffix
+    path, out, suffix = scene_file(options.scene), options.out, options.suffix
     check_folder(out)
     loaded = load_scene(path)
     echo_import_warnings(loaded, path.parent)
@@ -62,12 +62,14 @@ def surfaces(anatomy: LoadedAnatomy) -> dict[str, trimesh.Trimesh]:
     """The surfaces of an anatomy, by the names of their files: organ, tumour, parts, support, support-2,
     ...
     """
-    found = {"organ": anatomy.organ}
+    surfaces = {"organ": anatomy.organ}
     if anatomy.tumour is not None:
-        found["tumour"] = anatomy.tumour
-    found |= {PARTS[tissue]: part for tissue, part in anatomy.parts.items()}
+        surfaces["tumour"] = anatomy.tumour
+    surfaces |= {PARTS[tissue]: part for tissue, part in anatomy.parts.items()}
     supports = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
-    return found | {"support" if n == 1 else f"support-{n}": each for n, each in enumerate(supports, 1)}
+    return surfaces | {
+        "support" if n == 1 else f"support-{n}": support for n, support in enumerate(supports, 1)
+    }
 
 
 def save_volumes(scene: Scene, folder: Path, out: Path) -> list[str]:
@@ -89,6 +91,6 @@ def save_classes(scene: Scene, anatomy: LoadedAnatomy, out: Path) -> list[str]:
     """
     if anatomy.ct is None or anatomy.labels is None:
         return []
-    found = stored_tissue_map(anatomy.labels, anatomy, anatomy.ct, scene.image.atlas)
-    save_image(class_image(found), out / CLASS_IMAGE_FILE)
+    tissues = stored_tissue_map(anatomy.labels, anatomy, anatomy.ct, scene.image.atlas)
+    save_image(class_image(tissues), out / CLASS_IMAGE_FILE)
     return [CLASS_IMAGE_FILE]

@@ -57,17 +57,17 @@ class PlanOptions(QualityOptions):
 
 
 @command(PlanOptions)
-def plan(asked: PlanOptions) -> None:
+def plan(options: PlanOptions) -> None:
     """Plan a sweep over SCENE that covers the target, or a resection.
 
     SCENE is a scene file or a patient's folder. The organ deforms under the probe.
     """
-    if asked.resect:
-        plan_resection(asked)
+    if options.resect:
+        plan_resection(options)
         return
-    out = asked.out
+    out = options.out
     click.echo("Reading the patient.")
-    loaded, anatomy = load_patient(asked.scene, asked.changes, asked.quality)
+    loaded, anatomy = load_patient(options.scene, options.changes, options.quality)
     scene_probe, trocar = probe_of(loaded), loaded.trocar
     make_place(out, "--out")
     from rehearsal.planning.plan_search import make_plan, total_work
@@ -75,15 +75,15 @@ def plan(asked: PlanOptions) -> None:
     from rehearsal.planning.trial_workers import TrialWorkers
     from rehearsal.worker_processes import Workers
 
-    target: Target = asked.target or ("organ" if anatomy.tumour is None else "margin")
-    problem = PlanningProblem(loaded, anatomy, scene_probe, target, asked.margin_mm, trocar)
+    target: Target = options.target or ("organ" if anatomy.tumour is None else "margin")
+    problem = PlanningProblem(loaded, anatomy, scene_probe, target, options.margin_mm, trocar)
     if trocar.at_mm is None:
         click.echo("No trocar is given: all poses count as reachable.")
     with (
-        Workers(asked.jobs, asked.dask) as workers,
-        tqdm(total=total_work(asked.trials, asked.speed_mm_s), desc="plan", unit="trial") as bar,
+        Workers(options.jobs, options.dask) as workers,
+        tqdm(total=total_work(options.trials, options.speed_mm_s), desc="plan", unit="trial") as bar,
     ):
-        made = make_plan(TrialWorkers(problem, workers), asked.speed_mm_s, asked.trials, bar.update)
+        made = make_plan(TrialWorkers(problem, workers), options.speed_mm_s, options.trials, bar.update)
         bar.update(bar.total - bar.n)
     write_plan(made, out)
     click.echo(
@@ -93,42 +93,42 @@ def plan(asked: PlanOptions) -> None:
     )
     click.echo(
         f"Wrote {counted(len(made.sweeps), 'sweep')} to {out}; follow the first with: "
-        f"{rehearse_command_line(asked)}"
+        f"{rehearse_command_line(options)}"
     )
 
 
-def plan_resection(asked: PlanOptions) -> None:
+def plan_resection(options: PlanOptions) -> None:
     """Propose technique and line of a resection, and write them. Raises CommandError, ResectionError."""
     from rehearsal.resection.cut import hilum_of
     from rehearsal.resection.proposal import propose, why_first
     from rehearsal.resection.resection_page import draw_page, figures_of
     from rehearsal.resection.resection_plan import ResectionPlan, planned_cut, write_resection_plan
 
-    scene, anatomy = load_patient(asked.scene, asked.changes, asked.quality)
+    scene, anatomy = load_patient(options.scene, options.changes, options.quality)
     if anatomy.tumour is None:
         raise CommandError("--resect: this patient has no tumour; name its label when you import the patient")
-    make_place(asked.out, "--out")
-    about = anatomy.organ, anatomy.tumour, anatomy.parts, asked.margin_mm, anatomy.labels, anatomy.tissues
+    make_place(options.out, "--out")
+    about = anatomy.organ, anatomy.tumour, anatomy.parts, options.margin_mm, anatomy.labels, anatomy.tissues
     proposals = propose(*about, hilum_of(scene.attachment, np.zeros(3)))
     cuts = [planned_cut(proposal, np.zeros(3)) for proposal in proposals]
     write_resection_plan(
-        ResectionPlan(version=VERSION, anatomy=fingerprint(anatomy), margin_mm=asked.margin_mm, cuts=cuts),
-        asked.out,
+        ResectionPlan(version=VERSION, anatomy=fingerprint(anatomy), margin_mm=options.margin_mm, cuts=cuts),
+        options.out,
     )
-    best, picture = proposals[0], asked.out.with_name(f"{asked.out.name}.png")
+    best, picture = proposals[0], options.out.with_name(f"{options.out.name}.png")
     figures = figures_of(best.cut, best.judgement, anatomy.tumour)
     draw_page(best.cut, best.judgement, anatomy.tumour, figures, picture, "Planned resection")
     warnings = [
-        f"WARNING {each.settings.technique}: {text}"
-        for each in proposals
-        for text in each.judgement.warnings()
+        f"WARNING {proposal.settings.technique}: {text}"
+        for proposal in proposals
+        for text in proposal.judgement.warnings()
     ]
     click.echo("\n".join(filter(None, [table_of(proposals), why_first(proposals), *warnings])))
-    if asked.margin_mm > 0:
+    if options.margin_mm > 0:
         click.echo("An enucleation has no margin: --margin-mm 0 plans one.")
     click.echo(
-        f"Wrote {counted(len(cuts), 'cut')} to {asked.out}, and a picture of the first to {picture}; "
-        f"rehearse the first in a window with: {rehearse_command_line(asked)}"
+        f"Wrote {counted(len(cuts), 'cut')} to {options.out}, and a picture of the first to {picture}; "
+        f"rehearse the first in a window with: {rehearse_command_line(options)}"
     )
 
 
@@ -157,20 +157,20 @@ def table_of(proposals: list["Proposal"]) -> str:
     ]
     rows = [
         [
-            each.settings.technique,
-            each.cost_ml,
-            each.judgement.margin.least_mm,
-            each.judgement.parenchyma_removed_ml,
-            each.judgement.collecting_system_opened_mm2,
-            None if each.judgement.vessels is None else len(each.judgement.vessels),
+            proposal.settings.technique,
+            proposal.cost_ml,
+            proposal.judgement.margin.least_mm,
+            proposal.judgement.parenchyma_removed_ml,
+            proposal.judgement.collecting_system_opened_mm2,
+            None if proposal.judgement.vessels is None else len(proposal.judgement.vessels),
         ]
-        for each in proposals
+        for proposal in proposals
     ]
     return tabulate(rows, heads, floatfmt=".1f", missingval=NOT_LABELLED)
 
 
-def rehearse_command_line(asked: PlanOptions) -> str:
+def rehearse_command_line(options: PlanOptions) -> str:
     """The command line that follows a plan, with the same probe."""
-    scene = [] if asked.scene == EMBEDDED else [asked.scene]
-    probe = asked.changes.get("transducer.probe")
-    return shell_command("rehearse", *scene, *(["--probe", probe] if probe else []), "--plan", asked.out)
+    scene = [] if options.scene == EMBEDDED else [options.scene]
+    probe = options.changes.get("transducer.probe")
+    return shell_command("rehearse", *scene, *(["--probe", probe] if probe else []), "--plan", options.out)

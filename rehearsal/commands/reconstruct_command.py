@@ -83,7 +83,7 @@ class ReconstructOptions(ArchOptions):
 
 
 @command(ReconstructOptions)
-def reconstruct(asked: ReconstructOptions) -> None:
+def reconstruct(options: ReconstructOptions) -> None:
     """Reconstruct a volume from SWEEP, a tracked sweep (.igs.mha, .igs.nrrd).
 
     The sweep is from Nephron or PLUS. Writes volume.nrrd, volume.png and report.json; with ground-truth
@@ -91,38 +91,38 @@ def reconstruct(asked: ReconstructOptions) -> None:
     simulated tracker errors, it also writes the sweep that has them, tracked.igs.mha, or .igs.nrrd as the
     sweep.
     """
-    out, reference = asked.out, asked.reference
-    if asked.undo_compression and asked.scene is None:
+    out, reference = options.out, options.reference
+    if options.undo_compression and options.scene is None:
         raise CommandError("--undo-compression: needs the organ of a scene; name it with --scene")
-    images = read_sweep(asked.sweep)
-    images.constant |= load_constants(asked.config) if asked.config else {}
-    labels = read_ground_truth(asked.sweep)
-    errors = TrackingErrors(**{each.name: getattr(asked, each.name) for each in fields(TrackingErrors)})
+    images = read_sweep(options.sweep)
+    images.constant |= load_constants(options.config) if options.config else {}
+    labels = read_ground_truth(options.sweep)
+    errors = TrackingErrors(**{field.name: getattr(options, field.name) for field in fields(TrackingErrors)})
     if errors != TrackingErrors():
-        images = with_errors(images, reference, errors, asked.seed)
+        images = with_errors(images, reference, errors, options.seed)
     image_poses = image_poses_of(images, reference)
     about = _describe(images, image_poses)
-    patient = None if asked.scene is None else load_patient(asked.scene)
+    patient = None if options.scene is None else load_patient(options.scene)
     make_folder(out)
     if errors != TrackingErrors():
-        write_sweep(out / f"tracked{suffix_of(asked.sweep)}", images)
+        write_sweep(out / f"tracked{suffix_of(options.sweep)}", images)
     settings: dict[str, Any] = dict(
-        method=asked.method,
-        spacing_mm=asked.spacing_mm,
-        reach_mm=default_reach_mm(image_poses, asked.spacing_mm)
-        if asked.reach_mm is None
-        else asked.reach_mm,
+        method=options.method,
+        spacing_mm=options.spacing_mm,
+        reach_mm=default_reach_mm(image_poses, options.spacing_mm)
+        if options.reach_mm is None
+        else options.reach_mm,
     )
     places = None
-    if asked.undo_compression and patient is not None:
-        places = _compression_correction(patient, images, image_poses, reference, asked.arch)
+    if options.undo_compression and patient is not None:
+        places = _compression_correction(patient, images, image_poses, reference, options.arch)
     try:
         mask = lit_pixels(images.images)
         volumes = reconstruct_volumes(
             images, image_poses, mask, **settings, labels=labels, places=places, progress=bar
         )
     except ValueError as error:
-        raise CommandError(f"{asked.sweep.name}: {error}") from None
+        raise CommandError(f"{options.sweep.name}: {error}") from None
     with stages() as stage:
         stage("Writing the volumes")
         save_volumes(volumes, out)
@@ -135,7 +135,7 @@ def reconstruct(asked: ReconstructOptions) -> None:
         version=VERSION,
         **settings,
         reference=reference,
-        undo_compression=asked.undo_compression,
+        undo_compression=options.undo_compression,
         tracker=asdict(errors),
         **about,
         shape=list(volumes.box.shape),
@@ -201,17 +201,19 @@ def _metrics(
     surfaces = surfaces_of(patient[1])
     try:
         # A box that encloses both could exceed the memory.
-        found = {} if are_apart(volumes.box, surfaces["organ"]) else compare_with_surfaces(volumes, surfaces)
+        comparison = (
+            {} if are_apart(volumes.box, surfaces["organ"]) else compare_with_surfaces(volumes, surfaces)
+        )
     except ValueError as error:
         return {}, f"Not compared with the whole organ: {error}"
-    scanned = found["organ"]["scanned"] if "organ" in found else 0.0
+    scanned = comparison["organ"]["scanned"] if "organ" in comparison else 0.0
     if scanned < LEAST_SCANNED:
         return {}, (
             f"Not compared: the sweep covers {100 * scanned:.1f} % of this organ, so it is of another organ "
             "or patient. Name its own "
             "scene with --scene."
         )
-    return found, ""
+    return comparison, ""
 
 
 def in_words(report: dict[str, Any]) -> str:

@@ -13,23 +13,23 @@ from render.keys import keys_text
 
 
 @command(RehearseOptions)
-def rehearse(asked: RehearseOptions) -> None:
+def rehearse(options: RehearseOptions) -> None:
     """Press the kidney of SCENE with the probe and see its ultrasound image.
 
     SCENE is a scene file or a patient's folder; without one it is the embedded patient.
     """
-    if not asked.headless and not display_available():
+    if not options.headless and not display_available():
         click.echo(f"No display ({why_no_display()}): running the scripted press without a window.")
-        asked.headless = True
-    if asked.seconds is not None and not asked.headless:
+        options.headless = True
+    if options.seconds is not None and not options.headless:
         raise CommandError(
             "--seconds: a window stays open until it is closed; leave it out, or add --headless"
         )
-    with started_process(not asked.headless) as process:
+    with started_process(not options.headless) as process:
         from rehearsal.opening import opened
 
-        with opened(asked, process) as run:
-            if asked.headless:
+        with opened(options, process) as run:
+            if options.headless:
                 run.headless()
             else:
                 run.in_window()

@@ -96,7 +96,7 @@ class RehearseOptions(LinkOptions, QualityOptions, ArchOptions):
     @property
     def preset(self) -> str | None:
         """The preset: of --quality, or the one for --rate."""
-        chosen = self.given(*LEFT, *TISSUE_AND_STEP)
+        chosen = self.set_by_user(*LEFT, *TISSUE_AND_STEP)
         return "fast" if self.rate is not None and not chosen else self.quality
 
     def check(self) -> None:
@@ -105,12 +105,14 @@ class RehearseOptions(LinkOptions, QualityOptions, ArchOptions):
         """
         for table, wrong in ((EXCLUDING, 2), (NEEDING, 1)):
             for (first, second), text in table.items():
-                if self.given(first) and len(self.given(first, second)) == wrong:
+                if self.set_by_user(first) and len(self.set_by_user(first, second)) == wrong:
                     raise CommandError(text)
-        choosers = [field for field in LEFT if self.given(field)]
-        for option in self.given(*choosers, *OPTIONS) if self.replay else ():
+        choosers = [field for field in LEFT if self.set_by_user(field)]
+        for option in self.set_by_user(*choosers, *OPTIONS) if self.replay else ():
             raise CommandError(f"{option}: a replay computes what was recorded; leave it out")
         for chooser in choosers[:1]:
-            for option in self.given(*(field for field in TISSUE_AND_STEP if field not in LEFT[chooser])):
-                (other,) = self.given(chooser)
+            for option in self.set_by_user(
+                *(field for field in TISSUE_AND_STEP if field not in LEFT[chooser])
+            ):
+                (other,) = self.set_by_user(chooser)
                 raise CommandError(f"{option}: {other} chooses this too; leave one of them out")

@@ -61,58 +61,58 @@ class ScanOptions(ArchOptions):
 
 
 @command(ScanOptions)
-def scan(asked: ScanOptions) -> None:
+def scan(options: ScanOptions) -> None:
     """Make images of SCENE at a list of probe poses.
 
     SCENE is a scene file or a patient's folder, at rest as in the CT.
     Writes a PNG image for each pose of a file, and scan.json with the size of the pixels.
     """
-    out, pose_by_name = asked.out, load_poses(asked.poses)
-    loaded, anatomy = load_patient(asked.scene, asked.changes)
+    out, pose_by_name = options.out, load_poses(options.poses)
+    loaded, anatomy = load_patient(options.scene, options.changes)
     if anatomy.ct is None:
         raise CommandError(
-            f"{scene_file(asked.scene)}: has no CT: expected anatomy.ct, from which the images are made"
+            f"{scene_file(options.scene)}: has no CT: expected anatomy.ct, from which the images are made"
         )
     warn_of_deep_poses(pose_by_name.values(), anatomy.organ)
     scan_probe, settings = probe_of(loaded), loaded.image
-    if asked.mode_needs_b_mode and settings.mode == "ct":
+    if options.mode_needs_b_mode and settings.mode == "ct":
         raise CommandError(
             "--picture ct: --doppler and --iq are made from a B-mode image; leave them out, or choose both "
             "or b-mode"
         )
-    if asked.iq is not None and settings.detail_level == "reflection":
+    if options.iq is not None and settings.detail_level == "reflection":
         raise CommandError("--iq: the detail level reflection has no phase; choose speckle or elevation")
-    if asked.clamped and asked.doppler == "off":
+    if options.clamped and options.doppler == "off":
         raise CommandError("--clamped: changes only Doppler; add --doppler colour or power, or leave it out")
-    if asked.iq is not None and scan_probe.compound_angles > 1:
+    if options.iq is not None and scan_probe.compound_angles > 1:
         raise CommandError(
             f"--iq: CompoundAngles = {scan_probe.compound_angles} of the probe averages images, which have "
             "no one signal; "
             "choose a probe with 1"
         )
-    used = start_taichi(asked.arch)
+    used = start_taichi(options.arch)
     from rehearsal.pose_scans import PoseScans
 
     make_folder(out)
-    scans = PoseScans(anatomy, anatomy.ct, scan_probe, settings, asked.contact, out)
-    with scans.recording(asked.sweep):
+    scans = PoseScans(anatomy, anatomy.ct, scan_probe, settings, options.contact, out)
+    with scans.recording(options.sweep):
         for name, pose in tqdm(pose_by_name.items(), desc="scan", unit="pose"):
             images = scans.images(pose)
-            if asked.iq is not None:
-                scans.save_iq(name, images, asked.iq)
+            if options.iq is not None:
+                scans.save_iq(name, images, options.iq)
             by_name = images.by_name
-            if asked.doppler != "off":
-                by_name = scans.with_doppler(images, asked.doppler, asked.clamped)
-            scans.save(name, by_name, asked.dicom)
+            if options.doppler != "off":
+                by_name = scans.with_doppler(images, options.doppler, options.clamped)
+            scans.save(name, by_name, options.dicom)
     report = dict(
         version=VERSION,
         probe=scan_probe.model_dump(by_alias=True),
         detail_level=settings.detail_level,
         atlas=settings.atlas,
-        contact=asked.contact,
+        contact=options.contact,
         contact_gap_mm=scans.scanner.contact_gap_mm,
-        doppler=asked.doppler,
-        clamped=asked.clamped,
+        doppler=options.doppler,
+        clamped=options.clamped,
         arch=used,
         pictures=scans.rows,
     )
@@ -122,7 +122,7 @@ def scan(asked: ScanOptions) -> None:
             f"Warning: {scans.empty} of {len(pose_by_name)} poses show nothing of the organ; they may be of "
             "another patient."
         )
-    sweep = ", sweep.igs.mha" if asked.sweep else ""
+    sweep = ", sweep.igs.mha" if options.sweep else ""
     click.echo(
         f"Wrote {len(scans.rows)} images of {len(pose_by_name)} poses, scan.json{sweep} to {out}; "
         f"{np.median(scans.ms):.1f} ms per pose (median)."

@@ -85,7 +85,7 @@ class Pace:
         fewer = f"REDUCED ITERATIONS   {iterations} of {full}" if iterations < full else ""
         return "   ".join(filter(None, [longer, fewer]))
 
-    def watch(self, took_ms: float, length_s: float) -> None:
+    def note(self, took_ms: float, length_s: float) -> None:
         """Note the duration of a step of a length [s], and change the level if it is time to."""
         self._recent.append((took_ms, took_ms / self._limit_ms(length_s, BUSY)))
         took, busy = np.array(self._recent).T

@@ -172,7 +172,7 @@ class SolverLoop:
         clock = self._path.input_s, 1000 * late_s, pace.waits_for_input
         step = self._timeline.step(pose, length_s, pace.iterations(full), *clock)
         self._send(replace(self._timeline.newest(), pace=text))
-        pace.watch(step.took_ms, length_s)
+        pace.note(step.took_ms, length_s)
 
     def _plan_steps(self) -> None:
         """Choose the lengths of the steps that are due now."""

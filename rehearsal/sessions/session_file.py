@@ -76,14 +76,14 @@ class Header(_Line):
     @model_validator(mode="before")
     @classmethod
     def _has_this_format(cls, values: Any) -> Any:
-        found = values.get("nephron_session") if isinstance(values, dict) else None
-        if isinstance(found, int) and 0 < found < SESSION_FORMAT:
+        version = values.get("nephron_session") if isinstance(values, dict) else None
+        if isinstance(version, int) and 0 < version < SESSION_FORMAT:
             raise ValueError(
-                f"nephron_session = {found}: recorded by Nephron {found}, which replays it; record the "
+                f"nephron_session = {version}: recorded by Nephron {version}, which replays it; record the "
                 "session anew with this one"
             )
-        if found is not None and found != SESSION_FORMAT:
-            raise ValueError(f"nephron_session = {FOUND.repr(found)}: expected {SESSION_FORMAT}")
+        if version is not None and version != SESSION_FORMAT:
+            raise ValueError(f"nephron_session = {FOUND.repr(version)}: expected {SESSION_FORMAT}")
         return values
 
 
@@ -192,13 +192,13 @@ class Log:
         """For each command that restores a state its place, the number of that state, and the history
         before it.
         """
-        found, history = [], History()
+        restored, history = [], History()
         for place, (number, command) in enumerate(self.commands):
             after, to = history_after(history, number, command)
             if to is not None:
-                found.append((place, to, history))
+                restored.append((place, to, history))
             history = after
-        return found
+        return restored
 
 
 def history_after(history: History, number: int, command: Recorded | Move) -> tuple[History, int | None]:
@@ -354,12 +354,12 @@ def scene_of_log(header: Header, scene: Scene) -> Scene:
 def settings_apart(recorded: Scene, present: Scene) -> list[str]:
     """The settings of a session that are not its scene's, each in words; of a table only the name."""
     then, now = recorded_values(recorded), recorded_values(present)
-    found = []
+    differences = []
     for section in [name for name, values in then.items() if isinstance(values, dict)]:
         for key, value in then[section].items():
             there = now[section].get(key)
             if value != there:
                 is_table = isinstance(value, dict)
                 values = "" if is_table else f" {FOUND.repr(value)} (scene: {FOUND.repr(there)})"
-                found.append(f"{section}.{key}{values}")
-    return found
+                differences.append(f"{section}.{key}{values}")
+    return differences

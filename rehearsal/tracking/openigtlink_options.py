@@ -29,7 +29,7 @@ class LinkOptions(CommandOptions):
 def open_link(asked: LinkOptions) -> "OpenIGTLinkServer | None":
     """Open the server that the options describe; it closes when the command ends. Raises CommandError."""
     if not asked.link:
-        for option in asked.given("link_host", "link_port", "link_leads"):
+        for option in asked.set_by_user("link_host", "link_port", "link_leads"):
             raise CommandError(f"{option}: the link is off; add --link, or leave {option} out")
         return None
     from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer

@@ -127,14 +127,14 @@ class ScriptedHand:
 
 
 @command(FrameOptions)
-def frames(asked: FrameOptions) -> None:
+def frames(options: FrameOptions) -> None:
     """Measure pictures a second, pace and latency of SCENE in a window.
 
     A script presses and drags the probe by the clock.
     """
     if not display_available():
         raise CommandError("study frames: needs a display; on a machine without one start it under Xvfb")
-    shared = {name: getattr(asked, name) for name in FrameOptions.model_fields if name != "seconds"}
+    shared = {name: getattr(options, name) for name in FrameOptions.model_fields if name != "seconds"}
     hands: list[ScriptedHand] = []
 
     with started_process(True) as process:
@@ -143,17 +143,17 @@ def frames(asked: FrameOptions) -> None:
         with opened(RehearseOptions(**shared), process) as run:
 
             def lead(loop: "WindowLoop") -> None:
-                hands.append(ScriptedHand(loop, run.manipulator.home, run.start, asked.seconds))
+                hands.append(ScriptedHand(loop, run.manipulator.home, run.start, options.seconds))
                 loop.source = hands[0]
 
             run.in_window(prepare=lead)
             # Where the user has closed the window.
             hands[0].end()
-            figures = figures_of(run, hands[0], asked)
-    write_results(asked.out, "frames", figures, summary(figures))
+            figures = figures_of(run, hands[0], options)
+    write_results(options.out, "frames", figures, summary(figures))
 
 
-def figures_of(run: "RehearsalRun", hand: ScriptedHand, asked: FrameOptions) -> dict[str, Any]:
+def figures_of(run: "RehearsalRun", hand: ScriptedHand, options: FrameOptions) -> dict[str, Any]:
     """The figures of a run; times without the first BEGIN_S."""
     times, window, steps = hand.times, hand.loop.window, hand.times.steps
     layout, settings = window.layout, window.settings
@@ -165,7 +165,7 @@ def figures_of(run: "RehearsalRun", hand: ScriptedHand, asked: FrameOptions) -> 
         arch=run.arch,
         **scene.tissue.model_dump(),
         time_step_s=scene.solver.time_step_s,
-        rate=asked.rate,
+        rate=options.rate,
         substeps=settings.solver.substeps,
         iterations=settings.solver.iterations,
         drivers=[device.name for device in vulkan_devices()],

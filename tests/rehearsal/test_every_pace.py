@@ -15,8 +15,8 @@ from plan_ball import plan_of, sweep_of
 from settings_at_start import settings_with
 
 from rehearsal import run
-from rehearsal.asked_files import AskedFiles
 from rehearsal.commands.rehearse_options import RehearseOptions
+from rehearsal.input_files import InputFiles
 from rehearsal.live_settings import DEFAULT_KEYS, LiveSettings, initial_settings
 from rehearsal.loop.command import Move
 from rehearsal.measurements.live_measurements import LiveMeasurements
@@ -130,7 +130,7 @@ def test_every_tool_works_at_every_pace(built, process, tmp_path, capsys, pace):
     manipulator = begin(case, anatomy, process)
     settings, link = initial_settings(case), LiveLink()
     viewer = NullViewer(settings, everything(rehearsal, settings))
-    files = AskedFiles(Path(), case.scene, case.probe, DEFAULT_KEYS, plan=plan_down(rehearsal, loaded))
+    files = InputFiles(Path(), case.scene, case.probe, DEFAULT_KEYS, plan=plan_down(rehearsal, loaded))
     asked = RehearseOptions(out=tmp_path, link=True)
     built_for_window = run.Built(anatomy, process, manipulator, model.counts, model.serial)
     each = run.RehearsalRun(built_for_window, loaded, "cpu", asked, files, viewer, link)

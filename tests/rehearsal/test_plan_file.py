@@ -11,8 +11,8 @@ from plan_ball import ORIGIN, plan_of, straight_pass, sweep_of
 from pydantic import ValidationError
 
 import app
-from rehearsal.asked_files import check_plan, check_reach
 from rehearsal.commands.plan_command import over_limit_warning
+from rehearsal.input_files import check_plan, check_reach
 from rehearsal.planning import trial_workers
 from rehearsal.planning.plan_file import (
     APPROACH_S,

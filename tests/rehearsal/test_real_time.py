@@ -229,7 +229,7 @@ class ClockedLoop(SolverLoop):
         self.now_s, self.begun, self.hangs_s = 0.0, [], hangs_s
         monkeypatch.setattr("rehearsal.real_time.solver_loop.perf_counter", lambda: self.now_s)
         pace = Pace(1 / 60)
-        pace.level, pace.watch = level, lambda *_: None
+        pace.level, pace.note = level, lambda *_: None
         super().__init__(self, self, pace, None)
         poses = [np.eye(4) + np.eye(4, k=3) * number for number in range(1, len(inputs_s) + 1)]
         self.inputs = [Follow(pose=pose, input_s=at_s) for pose, at_s in zip(poses, inputs_s, strict=True)]
@@ -390,7 +390,7 @@ def test_behind_its_input_it_catches_up_at_a_limited_rate():
 
 def watched(pace: Pace, took_ms: float, steps: int) -> tuple[float, int]:
     for _ in range(steps):
-        pace.watch(took_ms, pace.length_s)
+        pace.note(took_ms, pace.length_s)
     return pace.length_s, pace.iterations(8)
 
 
@@ -414,7 +414,7 @@ def test_slow_steps_get_longer_then_have_fewer_iterations_and_return():
 def test_single_long_steps_change_nothing():
     pace = Pace(1 / 60)
     for number in range(2 * STEPS_UP):
-        pace.watch(100.0 if number % 3 == 0 else 5.0, 1 / 60)
+        pace.note(100.0 if number % 3 == 0 else 5.0, 1 / 60)
     assert pace.level == 0
 
 
@@ -430,7 +430,7 @@ def test_a_machine_of_one_speed_goes_to_one_level_and_stays(load):
     pace, levels = Pace(1 / 60), [0]
     for number in range(12 * STEPS_UP):
         unsteady = (1.0, 1.0, 1.5, 0.1, 1.0)[number % 5]
-        pace.watch(unsteady * load * pace.iterations(8) / 8 * 1000 / 60, pace.length_s)
+        pace.note(unsteady * load * pace.iterations(8) / 8 * 1000 / 60, pace.length_s)
         levels.append(pace.level)
     # The first at which a step takes at most half of the time that it simulates, else the last.
     enough = [n for n, (longer, share) in enumerate(LEVELS) if load * share <= 0.5 * longer]

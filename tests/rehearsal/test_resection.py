@@ -15,11 +15,11 @@ from conftest import ROOT
 from settings_at_start import settings_with
 
 from rehearsal.announcements import Announcements
-from rehearsal.asked_files import read_files
 from rehearsal.case import case_of
 from rehearsal.commands.command_line import CommandError
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.drawn_geometry import drawn_geometry
+from rehearsal.input_files import read_files
 from rehearsal.loop.command import BeginAction, Bookmark, Checkpoint, Load, Mark, Move, Redo, Undo
 from rehearsal.loop.timeline import Timeline
 from rehearsal.measurements.live_measurements import LiveMeasurements

@@ -14,9 +14,9 @@ from null_viewer import NullViewer
 
 import app
 from rehearsal import headless, run
-from rehearsal.asked_files import AskedFiles
 from rehearsal.build_solver import step_settings
 from rehearsal.commands.rehearse_options import RehearseOptions
+from rehearsal.input_files import InputFiles
 from rehearsal.live_settings import DEFAULT_KEYS, LiveSettings, initial_settings
 from rehearsal.loop import timeline
 from rehearsal.loop.command import Move, NewSession, SetValues
@@ -94,12 +94,12 @@ def rewound(rehearsal: Rehearsal) -> Rehearsal:
     return rehearsal
 
 
-def files_of(rehearsal: Rehearsal, **named: Any) -> AskedFiles:
-    return AskedFiles(Path(), rehearsal.case.scene, rehearsal.case.probe, DEFAULT_KEYS, **named)
+def files_of(rehearsal: Rehearsal, **named: Any) -> InputFiles:
+    return InputFiles(Path(), rehearsal.case.scene, rehearsal.case.probe, DEFAULT_KEYS, **named)
 
 
 def run_of(
-    rehearsal: Rehearsal, loaded: LoadedAnatomy, asked: RehearseOptions, files: AskedFiles, viewer=None
+    rehearsal: Rehearsal, loaded: LoadedAnatomy, asked: RehearseOptions, files: InputFiles, viewer=None
 ):
     """A run whose steps are made in this process."""
     model = rehearsal.organ.model
@@ -259,7 +259,7 @@ def test_seconds_of_a_replay_are_counted_from_where_it_starts_in_the_recorded_le
     log = Log(header, [(number, Move(pose=np.eye(4), length_s=1 / 15)) for number in range(20)])
     replay = Replay(log)
     replay.place = 5
-    asked = SimpleNamespace(asked=RehearseOptions(seconds=seconds))
+    asked = SimpleNamespace(options=RehearseOptions(seconds=seconds))
     assert run.RehearsalRun._replayed_steps(asked, replay) == steps
 
 

@@ -20,9 +20,9 @@ from user_at_ball import ball_manipulator
 import app
 from rehearsal import headless, opening, run, window_loop, window_panel
 from rehearsal.announcements import Announcements
-from rehearsal.asked_files import AskedFiles
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.imaging import captions, readouts, scale_texts
+from rehearsal.input_files import InputFiles
 from rehearsal.live_settings import DEFAULT_KEYS
 from rehearsal.loop.command import BeginAction, Bookmark, Move, NewSession, SetValues, Undo
 from rehearsal.loop.frame import Frame, Step
@@ -36,7 +36,7 @@ from scenes.terminal import shell_command
 from settings import with_values
 from ultrasound.probe import load_probe
 
-FILES = AskedFiles(Path(), load_scene(EMBEDDED), load_probe("linear"), DEFAULT_KEYS)
+FILES = InputFiles(Path(), load_scene(EMBEDDED), load_probe("linear"), DEFAULT_KEYS)
 
 
 class FakeAnatomy:
@@ -577,7 +577,7 @@ def test_the_command_opens_the_link_for_as_long_as_it_runs_and_names_its_scene(m
 
     def headless_run(each: run.RehearsalRun, *_) -> None:
         socket.create_connection(("127.0.0.1", port), 5).close()
-        reached.append(each.link is not None and each.link.port == port and each.asked.scene == scene)
+        reached.append(each.link is not None and each.link.port == port and each.options.scene == scene)
         assert gc.get_freeze_count() > 0
 
     monkeypatch.setattr(opening, "start_taichi", lambda arch: "cpu")

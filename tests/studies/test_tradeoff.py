@@ -11,10 +11,10 @@ from small_bead_case import write_case
 
 import app
 from rehearsal import speed_accuracy
-from rehearsal.asked_files import as_asked
 from rehearsal.build_solver import step_settings
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.configuration import PRESETS, Setup, scene_of, setup_of
+from rehearsal.input_files import as_asked
 from rehearsal.measurements.run_report import numerical_error_of
 from rehearsal.speed_accuracy import (
     MEASURED,

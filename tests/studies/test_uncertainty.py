@@ -12,7 +12,7 @@ import trimesh
 from small_bead_case import briefly, small_anatomy
 
 import app
-from rehearsal.asked_files import AskedFiles, check_anatomy
+from rehearsal.input_files import InputFiles, check_anatomy
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.tumour_measurements import Measurement
 from rehearsal.measurements.uncertainty_bands import UncertaintyBands, UncertaintyError, read_bands
@@ -265,6 +265,6 @@ def test_a_file_of_bands_that_cannot_be_used_is_refused(tmp_path, text, words):
 
 
 def test_bands_of_another_patient_are_refused():
-    files = AskedFiles(None, briefly(1), None, None, bands=bands())
+    files = InputFiles(None, briefly(1), None, None, bands=bands())
     with pytest.raises(UncertaintyError, match="is of other anatomy than this scene"):
         check_anatomy(files, None, small_anatomy())

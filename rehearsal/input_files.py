@@ -37,7 +37,7 @@ MOST_OFF_MM = 1000.0
 
 
 @dataclass(frozen=True)
-class AskedFiles:
+class InputFiles:
     """What the user names, as read: the scene and its folder, the probe, and what else was named."""
 
     folder: Path
@@ -55,33 +55,33 @@ class AskedFiles:
     """Warnings of the import which the user has acknowledged."""
 
 
-def read_files(asked: RehearseOptions) -> AskedFiles:
+def read_files(options: RehearseOptions) -> InputFiles:
     """Read the files that the user names. Raises UserError, CommandError."""
-    path = scene_file(asked.scene)
+    path = scene_file(options.scene)
     scene = load_scene(path)
-    keys = load_keys(asked.keys, DEFAULT_KEYS) if asked.keys else DEFAULT_KEYS
-    asked.check()
-    track = load_track(asked.track, asked.track_from) if asked.track else None
+    keys = load_keys(options.keys, DEFAULT_KEYS) if options.keys else DEFAULT_KEYS
+    options.check()
+    track = load_track(options.track, options.track_from) if options.track else None
     plan = resection_plan = None
-    if asked.plan is not None and is_resection_plan(asked.plan):
-        resection_plan = read_resection_plan(asked.plan)
-        if asked.headless and not (asked.track or asked.replay):
+    if options.plan is not None and is_resection_plan(options.plan):
+        resection_plan = read_resection_plan(options.plan)
+        if options.headless and not (options.track or options.replay):
             raise CommandError(
-                f"--plan: {asked.plan} is a plan of a resection, and the scripted press cuts nothing; open "
+                f"--plan: {options.plan} is a plan of a resection, and the scripted press cuts nothing; open "
                 "it in a window, or add poses "
                 "with a cut (--track, such as docs/resection.json on the embedded patient) or a session "
                 "(--replay), which is then compared with it"
             )
-    elif asked.plan is not None:
-        plan = read_plan(asked.plan)
-    log = session_of(asked.replay, asked.at) if asked.replay else None
-    changed, probe = as_asked(scene, asked) if log is None else as_recorded(log, scene)
+    elif options.plan is not None:
+        plan = read_plan(options.plan)
+    log = session_of(options.replay, options.at) if options.replay else None
+    changed, probe = as_asked(scene, options) if log is None else as_recorded(log, scene)
     bands = None if scene.uncertainty is None else read_bands(path.parent / scene.uncertainty)
     of_import = [find(scene, path.parent) for find in (open_warnings, acknowledged_warnings)]
-    return AskedFiles(path.parent, changed, probe, keys, track, plan, resection_plan, log, bands, *of_import)
+    return InputFiles(path.parent, changed, probe, keys, track, plan, resection_plan, log, bands, *of_import)
 
 
-def check_anatomy(files: AskedFiles, asked: RehearseOptions, anatomy: LoadedAnatomy) -> None:
+def check_anatomy(files: InputFiles, options: RehearseOptions, anatomy: LoadedAnatomy) -> None:
     """Raises UserError if session, track or plan belong to other anatomy than the scene."""
     log = files.log
     if log is not None and fingerprint(anatomy) != log.header.anatomy:
@@ -96,9 +96,9 @@ def check_anatomy(files: AskedFiles, asked: RehearseOptions, anatomy: LoadedAnat
             "uncertainty out"
         )
     plans = [] if files.plan is None else [files.plan]
-    if files.track is not None and asked.track is not None:
-        check_near(files.track, anatomy.organ.vertices, asked.track)
-        plans += [read_plan(asked.track)] if is_plan(asked.track) else []
+    if files.track is not None and options.track is not None:
+        check_near(files.track, anatomy.organ.vertices, options.track)
+        plans += [read_plan(options.track)] if is_plan(options.track) else []
     for plan in plans:
         check_plan(plan, fingerprint(anatomy), files.probe)
         check_reach(plan, anatomy.organ.vertices)
@@ -110,13 +110,13 @@ def check_anatomy(files: AskedFiles, asked: RehearseOptions, anatomy: LoadedAnat
         )
 
 
-def as_asked(scene: Scene, asked: RehearseOptions) -> tuple[Scene, Probe]:
+def as_asked(scene: Scene, options: RehearseOptions) -> tuple[Scene, Probe]:
     """A scene with the options of the command line, and its probe; prints if they change the tissue model.
 
     Raises SceneError, ProbeError.
     """
-    changed = with_quality(with_options(scene, asked.changes), asked.preset)
-    if "tissue.model" not in asked.changes and changed.tissue.model != scene.tissue.model:
+    changed = with_quality(with_options(scene, options.changes), options.preset)
+    if "tissue.model" not in options.changes and changed.tissue.model != scene.tissue.model:
         click.echo(f"Tissue model: {changed.tissue.model}, as the options ask for it.")
     return changed, probe_of(changed)
 
@@ -160,10 +160,10 @@ def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:
             "a patient imported again counts as another"
         )
     planned = _probe_name(plan.probe.get("TransducerName"), plan.probe.get("HousingMm"))
-    found = _probe_name(probe.transducer_name, probe.housing_mm)
-    if planned != found:
+    present = _probe_name(probe.transducer_name, probe.housing_mm)
+    if planned != present:
         raise PlanError(
-            f"the plan is for the probe {planned}, found {found}: choose it with --probe, or plan anew"
+            f"the plan is for the probe {planned}, found {present}: choose it with --probe, or plan anew"
         )
 
 
@@ -186,4 +186,4 @@ def check_reach(plan: Plan, organ: np.ndarray) -> None:
 
 
 def _probe_name(name: Any, housing_mm: Any) -> str:
-    return f"{name!r} of {' x '.join(f'{each:g}' for each in housing_mm or ())} mm"
+    return f"{name!r} of {' x '.join(f'{length:g}' for length in housing_mm or ())} mm"
