@@ -62,13 +62,9 @@ def embedding_cell_mm(tissue: TissueSection) -> float:
 def step_settings(tissue: TissueSection, section: SolverSection) -> StepSettings:
     """The settings of a step: the scene's, else the tissue model's, else the paper's."""
     names = {field.name for field in fields(StepSettings)}
-    own = {name: value for name, value in tissue.model_dump().items() if name in names}
-    of_section = {
-        name: value for name, value in section.model_dump(exclude_none=True).items() if name in names
-    }
-    return replace(
-        StepSettings(damping=section.damping_per_s), **(own | dict(tissue.step_defaults) | of_section)
-    )
+    values = tissue.model_dump() | dict(tissue.step_defaults) | section.model_dump(exclude_none=True)
+    own = {name: value for name, value in values.items() if name in names}
+    return replace(StepSettings(damping=section.damping_per_s), **own)
 
 
 def build_solver(
