@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from settings_at_start import settings_with
 
+from rehearsal.commands.plan_command import plan
 from rehearsal.commands.rehearse_command import rehearse
 from rehearsal.live_settings import LiveSettings
 from render.keys import with_next
@@ -144,8 +145,10 @@ def test_values_that_were_not_set_stay_defaults():
     assert settings.gravity.acceleration_m_s2 == 9.81
 
 
-def test_each_option_of_a_scene_is_one_of_rehearse_with_its_help():
-    options = {option for parameter in rehearse.params for option in parameter.opts}
+def test_each_option_of_a_scene_is_one_of_a_command_with_its_help():
+    options = {
+        option for command in (rehearse, plan) for parameter in command.params for option in parameter.opts
+    }
     assert {option.split("/")[0] for option in OPTIONS.values()} <= options
     assert all(setting.field.description for setting in SETTINGS if setting.option is not None)
     texts = {parameter.opts[0]: getattr(parameter, "help", "") for parameter in rehearse.params}
