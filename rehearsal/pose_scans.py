@@ -67,7 +67,7 @@ class PoseScans:
             self._sweep.close()
 
     def images(self, pose: np.ndarray) -> PlaneImages:
-        """Return the images of a pose (4, 4)."""
+        """The images of a pose (4, 4)."""
         began = perf_counter()
         self._planes.append(ImagePlane(pose, *self.probe.extent_mm))
         shown = (
@@ -99,7 +99,7 @@ class PoseScans:
     def with_doppler(
         self, images: PlaneImages, mode: DopplerMode, clamped: bool = False
     ) -> dict[str, np.ndarray]:
-        """Return the last pose's images by their names, with Doppler at the peak of systole."""
+        """The last pose's images by their names, with Doppler at the peak of systole."""
         return images.by_name | {DOPPLER: self.scanner.doppler(images, mode, SYSTOLE_S, clamped)}
 
     def save(self, name: str, images: dict[str, np.ndarray], dicom: bool) -> None:

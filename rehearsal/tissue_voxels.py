@@ -12,7 +12,7 @@ from ultrasound.acoustics import TissueVoxels, check_tissues
 def tissue_voxels(
     labels: Grid, anatomy: LoadedAnatomy, ct: Grid, draws: bool, origin: np.ndarray
 ) -> TissueVoxels:
-    """Return the tissue of each voxel, relative to an origin (3,) [mm]: as labelled, and as classified from
+    """The tissue of each voxel, relative to an origin (3,) [mm]: as labelled, and as classified from
     the CT.
 
     ``draws``: also what no CT shows.

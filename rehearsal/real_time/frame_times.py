@@ -50,7 +50,7 @@ class FrameTimes:
         self.ends_s.clear()
 
     def rates(self, recent_s: float = np.inf) -> tuple[float, float]:
-        """Return frames a second and the real-time factor, over the last seconds; 0, 1 where too little is
+        """Frames a second and the real-time factor, over the last seconds; 0, 1 where too little is
         known.
         """
         last_s = self.ends_s[-1][0] if self.ends_s else 0.0

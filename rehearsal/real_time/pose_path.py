@@ -42,7 +42,7 @@ class PosePath:
         self._left_s = left_s
 
     def pose_after(self, length_s: float) -> np.ndarray:
-        """Return the pose (4, 4) after a step of a length [s]; at the goal it stays."""
+        """The pose (4, 4) after a step of a length [s]; at the goal it stays."""
         arrives = length_s >= self._left_s * (1.0 - ROUNDING)
         share = 1.0 if arrives else length_s / self._left_s
         self.pose = self._goal if arrives else interpolated(self.pose, self._goal, share)

@@ -43,7 +43,7 @@ class SharedTissue:
             slot[...] = array
 
     def read(self, number: int) -> list[np.ndarray] | None:
-        """Return copies of the arrays of a number that the writer has sent; None where newer ones have
+        """Copies of the arrays of a number that the writer has sent; None where newer ones have
         taken their slot.
         """
         arrays = [slot.copy() for slot in self._slots[number % SLOTS]]
