@@ -57,15 +57,14 @@ class ProbeEnvironment(gymnasium.Env[Observation, np.ndarray]):
         start("cpu")
         probe = case_of(loaded, anatomy).probe
         self._trial = Trial(PlanningProblem(loaded, anatomy, probe, target, 5.0, loaded.trocar))
-        self._rehearsal, self._actions, self._pixels = self._trial.rehearsal, actions, pixels
+        self._rehearsal, self._actions, self._shape = self._trial.rehearsal, actions, (pixels, pixels)
         self.action_space = Box(-1.0, 1.0, (6,), np.float32)
         self.observation_space: Any = Dict(
-            image=Box(0, 255, (pixels, pixels), np.uint8),
+            image=Box(0, 255, self._shape, np.uint8),
             pose=Box(-np.inf, np.inf, (12,), np.float32),
             force=Box(-np.inf, np.inf, (3,), np.float32),
         )
         self._poses: list[np.ndarray] = []
-        self._score = 0.0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -91,9 +90,7 @@ class ProbeEnvironment(gymnasium.Env[Observation, np.ndarray]):
         return self._observation(), self._score - before, False, is_over, {"seen": terms.seen}
 
     def action_towards(self, goal: np.ndarray) -> np.ndarray:
-        """The action (6,) that moves the transducer to a pose (4, 4), or as far towards it as one can: to
-        follow a plan.
-        """
+        """The action (6,) that moves the transducer to a pose (4, 4), or as far towards it as one can."""
         pose, length_mm = self._rehearsal.organ.pose, self._rehearsal.case.size_mm[2]
         away_mm = array_face_centre(goal, length_mm) - array_face_centre(pose, length_mm)
         turn = Rotation.from_matrix(pose[:3, :3].T @ goal[:3, :3]).as_rotvec(degrees=True)
@@ -120,7 +117,5 @@ class ProbeEnvironment(gymnasium.Env[Observation, np.ndarray]):
     def _observation(self) -> Observation:
         pose = self._rehearsal.anatomy.probe_in_patient()[:3].ravel().astype(np.float32)
         force = np.zeros(3) if (wrench := self._rehearsal.frame.wrench) is None else wrench[:3]
-        return dict(image=self._image(), pose=pose, force=force.astype(np.float32))
-
-    def _image(self) -> np.ndarray:
-        return self._rehearsal.images("b-mode", shape=(self._pixels, self._pixels))["B-mode"]
+        image = self._rehearsal.images("b-mode", shape=self._shape)["B-mode"]
+        return dict(image=image, pose=pose, force=force.astype(np.float32))
