@@ -23,8 +23,7 @@ from sim.device import start
 from ultrasound.probe_manipulator import ManipulatorState, advanced, array_face_centre
 from ultrasound.target import Target
 
-# The greatest motion of an action along and about each axis of the transducer, and the speed with which it is
-# made.
+# The greatest motion of an action along and about each axis of the transducer, and its speed.
 MOST_MM, MOST_DEG, SPEED_MM_S = 3.0, 10.0, 20.0
 # An episode begins at a place that is this far from the middle, along both axes of the array face.
 BEGINS_WITHIN_MM = 12.0
