@@ -50,7 +50,7 @@ def in_order(frames: FrameFields, count: int, name: str) -> list[dict[str, str]]
     last = max(frames, default=-1)
     if len(frames) != count or last != count - 1:
         raise SweepError(f"{name} has {count} frames, but {len(frames)} have fields, the last is {last}")
-    return [frames[each] for each in range(count)]
+    return [frames[number] for number in range(count)]
 
 
 def accept(name: str, text: str, accepted: Sequence[str]) -> str:

@@ -24,19 +24,13 @@ TERRACE_SD = 0.7
 
 
 def surface_from_mask(mask: sitk.Image, faces: int = FACES) -> trimesh.Trimesh:
-    """Closed surface of the largest body in a label.
+    """The closed surface of the largest body in a label: a watertight mesh, normals outward, vertices (n, 3)
+    in LPS [mm].
 
-    The surface encloses the volume of that body (internal holes counted as tissue) to about 0.01 %.
-
-    Args:
-        mask: 3D image, non-zero inside the body; any spacing [mm], origin and direction.
-        faces: number of triangles, met within a few.
-
-    Returns:
-        Watertight mesh of one body, normals outward; vertices in LPS [mm], shape (vertex_count, 3).
-
-    Raises:
-        ValueError: the mask is empty, or so small or thin that it has no closed surface.
+    It encloses the volume of that body (internal holes counted as tissue) to about 0.01 %. ``mask`` is a 3D
+    image, non-zero inside the body, of any spacing [mm], origin and direction; ``faces`` is the number of
+    triangles, met within a few. Raises ValueError where the mask is empty, or so small or thin that it has no
+    closed surface.
     """
     solid, corner = _largest_solid(mask)
     spacing = np.array(mask.GetSpacing())

@@ -113,9 +113,9 @@ def file_with_voxels(path: Path) -> Path:
     if path.suffix.lower() in META:
         dimensions = [value for key, value in fields if key == "ndims"]
         if len(names) != 1 or dimensions != ["3"]:
-            found = " and ".join(dimensions)[:20] or "no"
+            count = " and ".join(dimensions)[:20] or "no"
             raise PatientError(
-                f"{path}: its header has {found} dimensions; expected one 3D volume and one file with its "
+                f"{path}: its header has {count} dimensions; expected one 3D volume and one file with its "
                 "voxels; export one volume"
             )
     if not names or names in (["LOCAL"], ["local"]):
