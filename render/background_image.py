@@ -267,7 +267,7 @@ def help_image(layout: WindowLayout, groups: Mapping[str, list[tuple[str, str]]]
 
 
 def in_columns(groups: Mapping[str, list[tuple[str, str]]]) -> list[list[tuple[str, str]]]:
-    """Arrange groups of rows in HELP_COLUMNS columns without splitting a group, each under its name."""
+    """Groups of rows in HELP_COLUMNS columns, none split, each under its name."""
     blocks = [[("", name), *rows, ("", "")] for name, rows in groups.items()]
     columns: list[list[tuple[str, str]]] = [[] for _ in range(HELP_COLUMNS)]
     share = sum(map(len, blocks)) / HELP_COLUMNS

@@ -101,7 +101,7 @@ def file_comments(path: Path) -> list[str]:
 def stated_space(path: Path) -> Space | None:
     """The coordinate system that a surface file states as 3D Slicer does, or None.
 
-    Raises PatientError: two, or another.
+    Raises PatientError where it states two, or another.
     """
     spaces = {name for text in file_comments(path) for name in SPACE_FIELD.findall(text)}
     if len(spaces) > 1 or not spaces <= {"LPS", "RAS"}:

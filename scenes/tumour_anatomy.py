@@ -59,7 +59,7 @@ def tumour_anatomy(
     tissues: dict[int, str] | None = None,
     hilum_mm: tuple[float, float, float] | None = None,
 ) -> TumourAnatomy:
-    """Measure the largest tumour of a kidney. All surfaces are closed, in LPS [mm].
+    """The measures of the largest tumour of a kidney. All surfaces are closed, in LPS [mm].
 
     ``organ`` includes its tumours and cysts; ``tumour`` is of one or several, apart from each other.
     ``parts`` are the surfaces of other parts by tissue: sinus, urine (collecting system), vessel, cyst.

@@ -131,7 +131,7 @@ class SampledVolume:
 
     @ti.func
     def along_z(self, voxel, t):
-        """Interpolate between a voxel and the next along z."""
+        """The value between a voxel and the next along z, at a fraction of their distance."""
         return tm.mix(self.voxels[voxel], self.voxels[voxel + 1], t)
 
     @ti.func

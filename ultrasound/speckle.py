@@ -57,10 +57,10 @@ def noise_block() -> np.ndarray:
 
 
 def elevation_levels(sd_mm: np.ndarray) -> np.ndarray:
-    """Return, for correlation SDs (n,) [mm], index of the shorter length, its weight, that of the next one,
-    and the shorter length.
+    """For correlation SDs (n,) [mm], index of the shorter length, its weight, that of the next one, and the
+    shorter length: (n, 4) float32.
 
-    (n, 4) float32. The length is that of the nearest index, up to 9 % off.
+    The length is that of the nearest index, up to 9 % off.
     """
     at = np.clip(np.log(sd_mm / SHORTEST_SD_MM) / np.log(LENGTH_STEP), 0, LEVELS - 1.001)
     level = np.floor(at)

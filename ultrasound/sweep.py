@@ -70,7 +70,9 @@ class Sweep:
 
     @property
     def times_s(self) -> np.ndarray:
-        """Time of each frame (n,) [s]; SweepError where a timestamp is missing or not a finite number."""
+        """Time of each frame (n,) [s]. Raises SweepError where a timestamp is missing or not a finite
+        number.
+        """
         times = np.full(len(self), np.nan)
         for frame, fields in enumerate(self.frames):
             text = fields.get("Timestamp", "")

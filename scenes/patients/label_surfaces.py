@@ -104,7 +104,8 @@ def _iso_surface(solid: np.ndarray, spacing: np.ndarray, step: float) -> trimesh
 
 
 def _one_solid(levels: np.ndarray, clear_of_zero: float) -> np.ndarray:
-    """Keep the largest region of negative levels, without cavities; no level nearer to zero than stated.
+    """Levels of which only the largest region of negative ones is left, without cavities; none is nearer to
+    zero than stated.
 
     The low-pass filter may cut a thin bridge or close a cleft, and a level of exactly zero gives triangles of
     zero area.
@@ -131,8 +132,8 @@ def decimate(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
 
 
 def _even_triangles(coarse: trimesh.Trimesh, fine: trimesh.Trimesh, iterations: int = 8) -> trimesh.Trimesh:
-    """Move the vertices along the fine surface towards the mean of their neighbours (tangential Laplacian
-    smoothing).
+    """The coarse surface with its vertices moved along the fine one towards the mean of their neighbours
+    (tangential Laplacian smoothing).
 
     Edge collapse leaves needles, which have poor contact normals and skinning weights. Connectivity and shape
     are kept: each iteration projects onto the fine surface.

@@ -163,7 +163,7 @@ def choose_organ(pieces: list[Organ], midline: float | None, side: Side | None) 
     """The organ on the requested side; where the CT shows no body, ``side`` or the label's name replaces the
     midline.
 
-    Raises PatientError: none, several, or a name of the other side.
+    Raises PatientError where there is none, or several, or one with a name of the other side.
     """
     ends = pieces[0].centre_x_mm, pieces[-1].centre_x_mm
     if midline is None and len(pieces) == 2 and ends[1] - ends[0] > KIDNEYS_APART_MM:

@@ -104,8 +104,8 @@ def _most_like_a_kidney(tissue: sitk.Image, seed: np.ndarray) -> np.ndarray:
 
 
 def _start(tissue: sitk.Image, hounsfield: np.ndarray, seed: np.ndarray) -> np.ndarray:
-    """The voxel (x, y, z) near the seed with the most soft tissue around it. Raises PatientError: the seed is
-    in none.
+    """The voxel (x, y, z) near the seed with the most soft tissue around it. Raises PatientError where the
+    seed is in none.
 
     In thick voxels, the cortex near the surface has the HU of the fat beside it.
     """

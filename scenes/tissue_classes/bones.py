@@ -42,7 +42,7 @@ def spine_middle(bone: np.ndarray) -> np.ndarray | None:
 
 
 def _filled(solid: np.ndarray, axis: int) -> np.ndarray:
-    """Fill the holes of each section across an axis."""
+    """The mask with the holes of each section across an axis filled."""
     beside = ndimage.generate_binary_structure(3, 1)
     beside[tuple(slice(None) if k != axis else [0, 2] for k in range(3))] = False
     parts, count = ndimage.label(~solid, beside)

@@ -30,7 +30,7 @@ def nifti_volume(path: Path, space: Space | None = None) -> LazyVolume:
     """Read the header of a volume; voxels are read on demand. ``space`` is that of a file without an
     orientation.
 
-    Raises PatientError: damaged, not 3D, sheared, no orientation.
+    Raises PatientError where it is damaged, not 3D, sheared, or without an orientation.
     """
     with parsing(f"{path}: cannot be read as NIfTI", "expected a whole file; copy or export it again"):
         image: Any = nibabel.load(path, keep_file_open=True)

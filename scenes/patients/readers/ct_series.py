@@ -78,8 +78,8 @@ class CtListing:
 def list_ct(path: Path, progress: Progress = silent, space: Space | None = None) -> CtListing:
     """The CT series and DICOM labels of a path as for ``open_ct``, from their headers.
 
-    A path with labels but without a CT has no series. Raises PatientError: not readable, or neither CT nor
-    labels.
+    A path with labels but without a CT has no series. Raises PatientError where the path cannot be read, or
+    has neither CT nor labels.
     """
     if not path.exists():
         raise PatientError(f"{path}: no such file or folder; check the path")
@@ -257,7 +257,7 @@ def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume
 
 @contextmanager
 def _naming(what: str, left_out: Sequence[str]) -> Iterator[None]:
-    """Adds to an error the files that were left out of a series, which may lack them."""
+    """Add to an error the files that were left out of a series, which may lack them."""
     try:
         yield
     except PatientError as error:

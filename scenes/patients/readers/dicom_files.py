@@ -91,8 +91,8 @@ def find_dicom_files(path: Path, unreadable: Callable[[OSError], object] | None 
 
     ``unreadable`` is called for each subfolder that cannot be listed.
 
-    Raises PatientError: too many or too large files, an archive that is damaged, encrypted or has paths
-    outside itself, a DICOMDIR whose files are missing or elsewhere.
+    Raises PatientError where files are too many or too large, an archive is damaged, encrypted or has paths
+    outside itself, or a DICOMDIR's files are missing or elsewhere.
     """
     if path.is_dir():
         items = _of_folder(path, unreadable)

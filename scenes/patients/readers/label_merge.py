@@ -19,9 +19,8 @@ MERGE_ORDER = (
 
 
 def merge_label_maps(maps: list[LabelMap], organ: Sequence[str] = ()) -> tuple[LabelMap, list[int] | None]:
-    """Merge one or more maps, which may overlap and have different grids, on the grid of the first with a
-    kidney, extended to cover all; return the merged map, and the values of the named organ, None where none
-    is named.
+    """One map of one or more, which may overlap and have different grids, on the grid of the first with a
+    kidney, extended to cover all; and the values of the named organ, None where none is named.
 
     ``organ`` has names or values of the segments that the user named as the organ: they are the organ alone,
     whatever covers them.
