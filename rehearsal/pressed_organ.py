@@ -110,20 +110,22 @@ class PressedOrgan:
 
         It is computed once for the same scene, probe and anatomy.
         """
-        position, velocity, *history = stored(self._warm_up, *self._inputs(), backend=backend())
-        names = self.solver.snapshot().history
+        position, velocity, *internal_state = stored(self._warm_up, *self._inputs(), backend=backend())
+        names = self.solver.snapshot().internal_state
         self.solver.restore(
-            SolverState(BodyState(position, velocity), dict(zip(names, history, strict=True)))
+            SolverState(BodyState(position, velocity), dict(zip(names, internal_state, strict=True)))
         )
         self.steps = 0
         self.divergence_check.set_initial_state()
         return self.snapshot()
 
     def _warm_up(self, *inputs: object) -> tuple[np.ndarray, ...]:
-        """The state at rest: positions, velocities and history. The inputs are those of the organ itself."""
+        """The state at rest: positions, velocities and internal variables. The inputs are those of the organ
+        itself.
+        """
         self.come_to_rest()
         state = self.solver.snapshot()
-        return state.body.position, state.body.velocity, *state.history.values()
+        return state.body.position, state.body.velocity, *state.internal_state.values()
 
     def come_to_rest(self) -> None:
         """The paper's warm-up, from the present state.

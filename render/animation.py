@@ -13,14 +13,14 @@ ANIMATION_QUALITY = 80
 
 
 def with_square_pixels(picture: np.ndarray, width_mm: float, depth_mm: float) -> Image.Image:
-    """Return an image of a plane with square pixels; the longer side keeps its number of pixels."""
+    """An image of a plane with square pixels; the longer side keeps its number of pixels."""
     scale = max(picture.shape[:2]) / max(width_mm, depth_mm)
     size = max(1, round(width_mm * scale)), max(1, round(depth_mm * scale))
     return Image.fromarray(picture).resize(size, Image.Resampling.BILINEAR)
 
 
 def side_by_side(view: View) -> Image.Image:
-    """Return the images of a view in a row, with square pixels."""
+    """The images of a view in a row, with square pixels."""
     pictures = [with_square_pixels(picture, view.width_mm, view.depth_mm) for picture in view.shown.values()]
     mode = "L" if view.doppler is None else "RGB"
     row = np.concatenate([np.asarray(picture.convert(mode)) for picture in pictures], axis=1)
@@ -36,7 +36,7 @@ def empty_folder(folder: Path) -> Path:
 
 
 def scaled_down(picture: Image.Image) -> Image.Image:
-    """Return an image no wider than the animation."""
+    """An image no wider than the animation."""
     width = min(ANIMATION_WIDTH, picture.width)
     return picture.resize((width, round(picture.height * width / picture.width)), Image.Resampling.LANCZOS)
 

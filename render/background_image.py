@@ -190,7 +190,7 @@ class BackgroundImage:
         self._rows[box.slices][..., :3] = image
 
     def plane_point_at(self, column: float, row: float) -> tuple[float, float] | None:
-        """Return the point of the image plane [mm] at a pixel of one of the images, None elsewhere."""
+        """The point of the image plane [mm] at a pixel of one of the images, None elsewhere."""
         if self._view is None or self._shows_help:
             return None
         hit = (box for box in image_boxes(self.layout, self._view) if box.contains(column, row))
@@ -198,7 +198,7 @@ class BackgroundImage:
 
 
 def backdrop(layout: WindowLayout, view: View, help_key: str = "H") -> np.ndarray:
-    """Return what stays the same from frame to frame, uint8, shape (height, width, 3)."""
+    """What stays the same from frame to frame, uint8, shape (height, width, 3)."""
     fade = np.linspace(0, 1, layout.scene.height)[:, None]
     rows = (1 - fade) * np.array(BACKDROP_TOP) + fade * np.array(BACKDROP_FOOT)
     page = np.empty((layout.height, layout.width, 3), dtype=np.uint8)
@@ -220,14 +220,14 @@ def backdrop(layout: WindowLayout, view: View, help_key: str = "H") -> np.ndarra
 
 
 def clock_box(layout: WindowLayout, help_key: str = "H") -> Rect:
-    """Return the box of the clock, in the title's row, left of the help hint."""
+    """The box of the clock, in the title's row, left of the help hint."""
     px = layout.px
     right = layout.title.right - 2 * px(16) - int(font(px(14)).getlength(HELP_HINT.format(help_key)))
     return Rect(right - px(CLOCK_WIDTH), 0, px(CLOCK_WIDTH), layout.title.height - 1)
 
 
 def clock_image(layout: WindowLayout, box: Rect, clock: str, pace: str) -> np.ndarray:
-    """Return the session's time and its rate, uint8, shape of the box."""
+    """The session's time and its rate, uint8, shape of the box."""
     image = Image.new("RGB", (box.width, box.height), STRIP)
     draw, letters, middle = ImageDraw.Draw(image), font(layout.px(14)), layout.title.height // 2
     draw.text((box.width, middle), clock, font=letters, fill=TEXT, anchor="rm")
@@ -237,7 +237,7 @@ def clock_image(layout: WindowLayout, box: Rect, clock: str, pace: str) -> np.nd
 
 
 def progress_image(layout: WindowLayout, text: str) -> np.ndarray:
-    """Return the program's name and what it prepares, uint8, shape (height, width, 3)."""
+    """The program's name and what it prepares, uint8, shape (height, width, 3)."""
     box, px = layout.whole, layout.px
     image = Image.new("RGB", (box.width, box.height), HELP)
     draw, middle = ImageDraw.Draw(image), (box.width // 2, box.height // 2)
@@ -247,7 +247,7 @@ def progress_image(layout: WindowLayout, text: str) -> np.ndarray:
 
 
 def help_image(layout: WindowLayout, groups: Mapping[str, list[tuple[str, str]]]) -> np.ndarray:
-    """Return the list of keys by group, uint8, shape (height, width, 3)."""
+    """The list of keys by group, uint8, shape (height, width, 3)."""
     box, px = layout.whole, layout.px
     image = Image.new("RGB", (box.width, box.height), HELP)
     draw = ImageDraw.Draw(image)
@@ -267,18 +267,20 @@ def help_image(layout: WindowLayout, groups: Mapping[str, list[tuple[str, str]]]
 
 
 def in_columns(groups: Mapping[str, list[tuple[str, str]]]) -> list[list[tuple[str, str]]]:
-    """Arrange groups of rows in HELP_COLUMNS columns without splitting a group, each under its name."""
+    """Groups of rows in HELP_COLUMNS columns, none split, each under its name."""
     blocks = [[("", name), *rows, ("", "")] for name, rows in groups.items()]
     columns: list[list[tuple[str, str]]] = [[] for _ in range(HELP_COLUMNS)]
     share = sum(map(len, blocks)) / HELP_COLUMNS
     for block in blocks:
-        column = next((each for each in columns if len(each) + len(block) / 2 <= share), columns[-1])
+        column = next(
+            (candidate for candidate in columns if len(candidate) + len(block) / 2 <= share), columns[-1]
+        )
         column += block
     return columns
 
 
 def readout_image(layout: WindowLayout, readouts: Mapping[str, str]) -> np.ndarray:
-    """Return names and values, one line each, as many as fit, uint8, shape of layout.readouts."""
+    """Names and values, one line each, as many as fit, uint8, shape of layout.readouts."""
     box = layout.readouts
     image = Image.new("RGB", (box.width, box.height), STRIP)
     draw = ImageDraw.Draw(image)
@@ -290,9 +292,7 @@ def readout_image(layout: WindowLayout, readouts: Mapping[str, str]) -> np.ndarr
 
 
 def findings_image(layout: WindowLayout, findings: Mapping[str, str], alert: str = "") -> np.ndarray:
-    """Return names and values, uint8, shape of layout.findings(count); the one named ``alert`` is
-    highlighted.
-    """
+    """Names and values, uint8, shape of layout.findings(count); the one named ``alert`` is highlighted."""
     box = layout.findings(len(findings))
     image = Image.new("RGB", (box.width, box.height), FINDINGS)
     draw = ImageDraw.Draw(image)
@@ -302,7 +302,7 @@ def findings_image(layout: WindowLayout, findings: Mapping[str, str], alert: str
 
 
 def first_of(figures: Mapping[str, str], most: int) -> dict[str, str]:
-    """Return the first figures, at most ``most``."""
+    """The first figures, at most ``most``."""
     return dict(islice(figures.items(), most))
 
 
@@ -327,8 +327,8 @@ def _draw_figures(
 
 
 def ends_of(axes: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    """Return the letters of the patient's axes and their directions on the screen (2,), right and up, the
-    farthest first.
+    """The letters of the patient's axes and their directions on the screen (2,), right and up, the farthest
+    first.
 
     ``axes`` (3, 3) are the camera's right, up and ahead, in the patient.
     """
@@ -354,7 +354,7 @@ def are_apart(places: np.ndarray, least: float) -> list[bool]:
 
 
 def compass_image(layout: WindowLayout, axes: np.ndarray) -> np.ndarray:
-    """Return the compass for a camera's axes (3, 3), uint8, shape of layout.compass.
+    """The compass for a camera's axes (3, 3), uint8, shape of layout.compass.
 
     Of two letters at the same place the nearer one is shown: at the opposite place it is the other axis's.
     """

@@ -15,11 +15,9 @@ HOME_DEG = (20.0, 32.0)
 class OrbitCamera:
     """Perspective camera that turns about a target and shows it in the middle of one part of the window.
 
-    Args:
-        bounds: box to frame [mm], shape (2, 3).
-        up: unit direction, shape (3,), that stays upright.
-        part: left, bottom, right, top of the part of the window that shows the scene, window coordinates.
-        aspect: width / height of the whole window.
+    It frames the box ``bounds`` (2, 3) [mm]; the unit direction ``up`` (3,) stays upright. ``part`` is the
+    part of the window that shows the scene: left, bottom, right, top, in window coordinates. ``aspect`` is
+    width / height of the whole window.
     """
 
     def __init__(self, bounds, up, part, aspect: float):
@@ -60,7 +58,7 @@ class OrbitCamera:
         return float(MARGIN * np.max(reach.max(axis=1) - offset @ ahead))
 
     def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return unit vectors to the right, up and ahead of the camera, world."""
+        """The unit vectors to the right, up and ahead of the camera, world."""
         azimuth, elevation = np.radians([self.azimuth_deg, self.elevation_deg])
         level = np.cos(azimuth) * self._ahead + np.sin(azimuth) * self._side
         ahead = np.cos(elevation) * level - np.sin(elevation) * self.up

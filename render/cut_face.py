@@ -20,8 +20,8 @@ EDGE_ON = 0.2
 
 
 def side_of_eye(pose: np.ndarray, eye: np.ndarray, before: float) -> float:
-    """Return the side of the image plane of a pose (4, 4) that the eye is on, 1 or -1; edge on, the side
-    ``before`` (0: none).
+    """The side of the image plane of a pose (4, 4) that the eye is on, 1 or -1; edge on, the side ``before``
+    (0: none).
     """
     toward = (eye - pose[:3, 3]) / np.linalg.norm(eye - pose[:3, 3])
     sine = float(toward @ pose[:3, 1])
@@ -29,8 +29,9 @@ def side_of_eye(pose: np.ndarray, eye: np.ndarray, before: float) -> float:
 
 
 def oriented_section(vertices: np.ndarray, faces: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return the section of a closed surface (n, 3), (m, 3) with the image plane of a pose (4, 4): segments
-    (k, 2, 2) along the pose's x and z, all in the same sense around the inside."""
+    """The section of a closed surface (n, 3), (m, 3) with the image plane of a pose (4, 4): segments (k, 2,
+    2) along the pose's x and z, all in the same sense around the inside.
+    """
     local = (vertices - pose[:3, 3]) @ pose[:3, :3]
     below = local[:, 1] < 0
     cut = faces[below[faces].any(axis=1) & ~below[faces].all(axis=1)]
@@ -52,7 +53,7 @@ class Raster:
 
     @classmethod
     def around(cls, segments: list[np.ndarray], count: int) -> "Raster":
-        """Return cells, ``count`` along each side, that contain segments (k, 2, 2)."""
+        """Cells, ``count`` along each side, that contain segments (k, 2, 2)."""
         points = np.concatenate([*segments, np.zeros((1, 2, 2))]).reshape(-1, 2)
         low, high = points.min(axis=0), points.max(axis=0)
         # Two more cells at each side: the outermost are empty.
@@ -60,13 +61,13 @@ class Raster:
         return cls(low - 2 * width, width, count)
 
     def places(self) -> np.ndarray:
-        """Return the centres (count * count, 2) of the cells, row by row."""
+        """The centres (count * count, 2) of the cells, row by row."""
         along = self.width * np.arange(self.count)
         return self.low + np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
 
     def covered(self, segments: np.ndarray) -> np.ndarray:
-        """Return the covered fraction of each cell inside segments (k, 2, 2) of one sense, shape (count,
-        count), by rows.
+        """The covered fraction of each cell inside segments (k, 2, 2) of one sense, shape (count, count), by
+        rows.
         """
         start, end = np.moveaxis((segments - self.low) / self.width, 1, 0)
         low, high = np.sort(np.stack([start[:, 1], end[:, 1]]), axis=0)
@@ -102,12 +103,14 @@ class CutFace:
         """Draw the section on the image plane of a pose (4, 4) into a scene, evenly lit by a light at
         ``key`` (3,).
         """
-        cuts = [oriented_section(array_of(each.vertices), each.faces, pose) for each in (organ, *inner)]
+        cuts = [
+            oriented_section(array_of(surface.vertices), surface.faces, pose) for surface in (organ, *inner)
+        ]
         raster = Raster.around(cuts, CELLS)
-        covered = [raster.covered(each).reshape(-1, 1) for each in cuts]
+        covered = [raster.covered(cut).reshape(-1, 1) for cut in cuts]
         colour = np.tile(FLESH, (CELLS**2, 1))
-        for share, each in zip(covered[1:], inner, strict=True):
-            colour += share * (np.array(each.base) - colour)
+        for share, surface in zip(covered[1:], inner, strict=True):
+            colour += share * (np.array(surface.base) - colour)
         most = np.max(covered, axis=0)
         places = raster.places()
         points = pose[:3, 3] + places @ pose[:3, [0, 2]].T

@@ -33,13 +33,13 @@ def display_available() -> bool:
 
 
 def wrong_depth() -> int | None:
-    """Return the screen's bits of colour, where no window can be opened on it for them."""
+    """The screen's bits of colour, where no window can be opened on it for them."""
     screen = None if sys.platform in ("win32", "darwin") else _of_x11(os.environ.get("DISPLAY"))
     return None if screen is None or screen.depth in DEPTHS else screen.depth
 
 
 def window_size() -> tuple[int, int]:
-    """Return width and height of a window [pixels] that fit the screen; FULL_SIZE where it is unknown."""
+    """Width and height of a window [pixels] that fit the screen; FULL_SIZE where it is unknown."""
     screen = _of_windows()
     if sys.platform not in ("win32", "darwin"):
         of_x11 = _of_x11(os.environ.get("DISPLAY"))
@@ -48,8 +48,8 @@ def window_size() -> tuple[int, int]:
 
 
 def fitted(width: int, height: int, scale: float = 1.0) -> tuple[int, int]:
-    """Return the size of a window on a screen of a size [pixels]: FULL_SIZE, enlarged by the screen's
-    scale, or as large as fits.
+    """The size of a window on a screen of a size [pixels]: FULL_SIZE, enlarged by the screen's scale, or as
+    large as fits.
     """
     room = min(width, HEIGHT_FRACTION * height * FULL_SIZE[0] / FULL_SIZE[1])
     wide = int(min(scale * FULL_SIZE[0], room)) // STEP * STEP
@@ -57,7 +57,7 @@ def fitted(width: int, height: int, scale: float = 1.0) -> tuple[int, int]:
 
 
 def _of_windows() -> tuple[int, int, float] | None:
-    """Return width, height and scale of the screen on Windows, in its own pixels, as GLFW does."""
+    """Width, height and scale of the screen on Windows, in its own pixels, as GLFW does."""
     if sys.platform != "win32":
         return None
     user = ctypes.windll.user32
@@ -69,7 +69,7 @@ def _of_windows() -> tuple[int, int, float] | None:
 
 @cache
 def _of_x11(display: str | None) -> X11Screen | None:
-    """Return an X server's screen. Cached: a server without clients may reset when asked again."""
+    """An X server's screen. Cached: a server without clients may reset when asked again."""
     if not display:
         return None
     try:
@@ -91,8 +91,8 @@ def _of_x11(display: str | None) -> X11Screen | None:
 
 
 def scale_of(resources: bytes) -> float:
-    """Return the scale in the resources of an X server, where desktops set it: Xft.dpi, from 96; 1 where
-    it is not there.
+    """The scale in the resources of an X server, where desktops set it: Xft.dpi, from 96; 1 where it is not
+    there.
     """
-    found = re.search(rb"^Xft\.dpi:\s*(\d+(\.\d+)?)", resources, re.MULTILINE)
-    return min(max(float(found[1]) / USUAL_DPI, 1.0), MOST_SCALE) if found else 1.0
+    match = re.search(rb"^Xft\.dpi:\s*(\d+(\.\d+)?)", resources, re.MULTILINE)
+    return min(max(float(match[1]) / USUAL_DPI, 1.0), MOST_SCALE) if match else 1.0

@@ -69,8 +69,8 @@ class Gamepad:
 
 
 def shaped(x: float, y: float) -> tuple[float, float]:
-    """Return a stick's deflection without its dead zone, fine near the centre, of length 1 at most, in the
-    same direction.
+    """A stick's deflection without its dead zone, fine near the centre, of length 1 at most, in the same
+    direction.
     """
     length = math.hypot(x, y)
     if length <= DEAD_STICK:
@@ -100,7 +100,7 @@ class SdlPads:
         self._pad: controller.Controller | None = None
 
     def read(self) -> PadState | None:
-        """Return the state of the connected gamepad, None where there is none."""
+        """The state of the connected gamepad, None where there is none."""
         events = self._pygame.event.get()
         if self._pad is not None and not self._pad.attached():
             self._pad = None

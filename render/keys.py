@@ -14,12 +14,12 @@ from settings import Setting, live_settings, value_of, with_values
 from text_files import TextError, read_toml
 
 # A key as printed -> as GGUI names it. GGUI reports no digits and no punctuation.
-KEYS = {each: each.lower() for each in string.ascii_uppercase}
-KEYS |= {each: each for each in ("Up", "Down", "Left", "Right", "Return")}
+KEYS = {letter: letter.lower() for letter in string.ascii_uppercase}
+KEYS |= {name: name for name in ("Up", "Down", "Left", "Right", "Return")}
 KEYS |= {"Esc": "Escape", "Space": " ", "Backspace": "BackSpace", "Tab": "Tab"}
 # With the shift key held; as GGUI names them, after this word.
 WITH_SHIFT = "Shift+"
-KEYS |= {WITH_SHIFT + each: WITH_SHIFT + name for each, name in KEYS.items()}
+KEYS |= {WITH_SHIFT + key: WITH_SHIFT + name for key, name in KEYS.items()}
 # In the order of SDL's game controllers.
 BUTTONS = (
     *("A", "B", "X", "Y", "Back", "Guide", "Start", "Left stick", "Right stick"),
@@ -136,7 +136,7 @@ class Keys:
         return {action: place for action, place in self.of.items() if place in KEYS}
 
     def action_of(self, pressed: str, with_shift: bool = False) -> str:
-        """Return the action of a key, as GGUI names it; empty where it has none.
+        """The action of a key, as GGUI names it; empty where it has none.
 
         A key that has none with shift has its usual one.
         """
@@ -145,18 +145,18 @@ class Keys:
         return next((of[name] for name in names if name in of), "")
 
     def held(self) -> list[tuple[str, str]]:
-        """Return the actions of held keys, each with its key as GGUI names it."""
+        """The actions of held keys, each with its key as GGUI names it."""
         return [(action, KEYS[self.of[action]]) for action in (*HELD, *VIEW_ACTIONS)]
 
     def lines(self) -> dict[str, list[tuple[str, str]]]:
-        """Return keys and texts of all actions by group, for the help."""
+        """Keys and texts of all actions by group, for the help."""
         return {
             group: [(" / ".join(map(self.of.__getitem__, actions)), text) for text, actions in lines.items()]
             for group, lines in self.groups.items()
         }
 
     def worded(self, text: str) -> str:
-        """Return a text with actions in braces replaced by their keys: "{sweep} stops it"."""
+        """A text with actions in braces replaced by their keys: "{sweep} stops it"."""
         return re.sub(r"\{(\w+)\}", lambda braces: self.of.get(braces[1], braces[0]), text)
 
 
@@ -176,7 +176,7 @@ def default_keys(settings: Iterable[Setting] = ()) -> Keys:
 
 
 def load_keys(path: Path, usual: Keys) -> Keys:
-    """Return the keys of a TOML file, and the usual ones of those that it leaves out. Raises KeysError."""
+    """The keys of a TOML file, and the usual ones of those that it leaves out. Raises KeysError."""
     try:
         file = _File.model_validate(read_toml(path))
     except (FileNotFoundError, NotADirectoryError):
@@ -198,7 +198,7 @@ def load_keys(path: Path, usual: Keys) -> Keys:
 
 
 def keys_text(keys: Keys) -> str:
-    """Return keys as the TOML file that ``load_keys`` reads."""
+    """The keys as the TOML file that ``load_keys`` reads."""
     named = ", ".join(key for key in KEYS if len(key) > 1 and not key.startswith(WITH_SHIFT))
     rows = [HEAD.format(named=named, buttons=", ".join(BUTTONS)), "[keys]"]
     for group, lines in keys.groups.items():
@@ -218,7 +218,7 @@ def _with(
     places: Iterable[str],
     mouse: Collection[str],
 ) -> dict[str, str]:
-    """Return the usual keys or buttons of actions, with some changed. Raises KeysError."""
+    """The usual keys or buttons of actions, with some changed. Raises KeysError."""
     printed = {place.lower(): place for place in places}
     chosen = dict(usual)
     for action, place in changes.items():

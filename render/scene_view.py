@@ -123,7 +123,7 @@ class SceneView:
         self._organ.draw(scene, ahead if opacity < SOLID or cut is not None else None, cut)
 
     def _inner(self, view: View, shown: ViewSettings) -> list[ShadedSurface]:
-        """Return the shown surfaces inside the organ."""
+        """The shown surfaces inside the organ."""
         surfaces = list(self._parts) if shown.show_parts else []
         if self._tumour is not None and shown.show_tumour:
             self._tumour.tint(view.seen.get("tumour"))
@@ -241,7 +241,7 @@ class ScoreLines:
             (closed(line), np.where(near[:, None], NEAR, SCORED)),
             (crosses.reshape(-1, 2, 3), np.tile(SCORED, (2 * len(crosses), 1))),
         )
-        segments, colours = (np.concatenate([each[k] for each in drawn]) for k in range(2))
+        segments, colours = (np.concatenate([lines[k] for lines in drawn]) for k in range(2))
         segments = segments + SCORE_LIFT_MM * toward
         if len(segments) == 0:
             return

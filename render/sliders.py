@@ -32,7 +32,7 @@ Groups = dict[str, list[Setting]]
 
 
 def groups_of(settings: WindowSettings, geometry: Geometry) -> Groups:
-    """Return the settings with a control, by group."""
+    """The settings with a control, by group."""
     # Settings of structures that the scene does not have.
     unused = {"show_tumour", "outline", "margin_mm"} if geometry.tumour is None else set()
     unused |= set() if geometry.parts else {"show_parts"}
@@ -45,7 +45,7 @@ def groups_of(settings: WindowSettings, geometry: Geometry) -> Groups:
 
 
 def boxes_of(settings: WindowSettings, geometry: Geometry, layout: WindowLayout) -> dict[str, Rect]:
-    """Return the box of each group.
+    """The box of each group.
 
     Where boxes would be too narrow for their labels, the first are left out.
     """
@@ -113,7 +113,7 @@ def _slid(gui, label: str, value: float, is_whole: bool, low: float, high: float
 
 
 def _beside_panel(settings: WindowSettings, groups: Groups, layout: WindowLayout) -> dict[str, Rect]:
-    """Return the boxes of the scanner's groups; the last are left out where findings would be covered."""
+    """The boxes of the scanner's groups; the last are left out where findings would be covered."""
     sizes = {
         name: (
             max(LEAST_WIDTH, round(_width(settings, members))),
@@ -129,7 +129,7 @@ def _beside_panel(settings: WindowSettings, groups: Groups, layout: WindowLayout
 
 
 def _width(settings: WindowSettings, members: Sequence[Setting]) -> float:
-    """Return the width that a group needs for its labels [pixels]."""
+    """The width that a group needs for its labels [pixels]."""
     return max(_width_of(settings, member) for member in members)
 
 
@@ -143,7 +143,7 @@ def _width_of(settings: WindowSettings, member: Setting) -> float:
 
 
 def _labels(settings: WindowSettings, member: Setting) -> list[str]:
-    """Return the text of a control: of each number of a tuple one, of a button with the value."""
+    """The text of a control: of each number of a tuple one, of a button with the value."""
     value = value_of(settings, member)
     if isinstance(value, tuple):
         return [str(number) for number in range(1, len(value) + 1)]

@@ -77,14 +77,14 @@ class SoftwareScene:
         """Add triangles of vertex ``indices`` (3 m,); fields (n,) of vertices [mm], normals, and colours
         with or without alpha.
         """
-        given = array_of(vertices), array_of(normals), array_of(per_vertex_color), indices
+        arrays = array_of(vertices), array_of(normals), array_of(per_vertex_color), indices
         if self._drawn:
-            self._drawn.append(self._lit(*given, two_sided))
+            self._drawn.append(self._lit(*arrays, two_sided))
             return
         seen_by = self._eye, self._axes, self._ambient, np.array(self._lights), two_sided
-        inputs = list(map(np.asarray, (*given, *seen_by)))
+        inputs = list(map(np.asarray, (*arrays, *seen_by)))
         if self._first is None or not all(map(np.array_equal, inputs, self._first[0])):
-            self._first = [each.copy() for each in inputs], self._lit(*given, two_sided)
+            self._first = [array.copy() for array in inputs], self._lit(*arrays, two_sided)
         self._drawn.append(self._first[1])
 
     def _lit(self, points, normals, colours, indices, two_sided: bool) -> Projected:
@@ -148,9 +148,9 @@ class SoftwareScene:
 
     def _draw(self, drawn: list[Projected], box: Rect, columns: np.ndarray) -> None:
         starts = np.cumsum([0, *(len(screen) for screen, _, _ in drawn)])
-        screen, colours = (np.concatenate([each[k] for each in drawn]) for k in (0, 1))
+        screen, colours = (np.concatenate([projected[k] for projected in drawn]) for k in (0, 1))
         triangles = np.concatenate(
-            [each[2] + start for each, start in zip(drawn, starts, strict=False)], dtype=np.int32
+            [projected[2] + start for projected, start in zip(drawn, starts, strict=False)], dtype=np.int32
         )
         rows = self.size[1] - box.bottom, self.size[1] - box.top
         _draw(screen, colours, triangles, box.left, box.right, *rows, self._depth, columns)

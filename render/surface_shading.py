@@ -42,11 +42,8 @@ class DrawnMesh:
 class ShadedSurface:
     """Normals and colours of one triangle mesh whose vertices move.
 
-    Args:
-        vertices: field of 3-vectors, shape (n,) [mm].
-        faces: int32, shape (m, 3), normals outward.
-        base: red, green, blue in [0, 1].
-        gloss: strength of the sheen; 0 is matt.
+    ``vertices`` is a field (n,) of 3-vectors [mm]; ``faces`` (m, 3), int32, have their normals outward.
+    ``base`` is red, green and blue in [0, 1]; ``gloss`` is the strength of the sheen, 0 of a matt surface.
     """
 
     def __init__(self, vertices, faces: np.ndarray, base=ORGAN, gloss: float = 0.30):
@@ -112,8 +109,8 @@ class ShadedSurface:
         scene.mesh(self.vertices, self.indices(ahead, cut), self.normal, **colours)
 
     def indices(self, ahead: np.ndarray | None = None, cut: Cut | None = None) -> np.ndarray:
-        """Return vertex indices of the faces, int32 (3 m,), farthest first along `ahead` if given, without
-        faces removed by a cut.
+        """Vertex indices of the faces, int32 (3 m,), farthest first along `ahead` if given, without faces
+        removed by a cut.
         """
         if ahead is None:
             return self.faces.reshape(-1)

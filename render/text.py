@@ -17,13 +17,13 @@ PLATE, PLATE_PX = 0.35, 4
 
 @lru_cache(maxsize=64)
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Return the font of all texts."""
+    """The font of all texts."""
     return ImageFont.load_default(size=size)
 
 
 def fitting_size(rows: Iterable[tuple[str, ...]], width: int, most: int) -> int:
-    """Return the largest font size, up to ``most``, at which the longest texts of all columns fit beside
-    each other.
+    """The largest font size, up to ``most``, at which the longest texts of all columns fit beside each
+    other.
     """
     columns = list(zip(*rows, strict=True))
     for size in range(most, LEAST_FONT_PX, -1):
@@ -33,7 +33,7 @@ def fitting_size(rows: Iterable[tuple[str, ...]], width: int, most: int) -> int:
 
 
 def shortened(text: str, size: int, width: int) -> str:
-    """Return a line without the last parts, and a single part without the end, that do not fit."""
+    """A line without the last parts, and a single part without the end, that do not fit."""
     parts = text.split(SEPARATOR)
     while len(parts) > 1 and font(size).getlength(SEPARATOR.join(parts)) > width:
         parts.pop()
@@ -47,7 +47,7 @@ def shortened(text: str, size: int, width: int) -> str:
 
 @lru_cache(maxsize=64)
 def _coverage(text: str, size: int) -> np.ndarray:
-    """Return the covered fraction of each pixel of a text, (rows, columns, 1), with a border."""
+    """The covered fraction of each pixel of a text, (rows, columns, 1), with a border."""
     left, top, right, bottom = ImageDraw.Draw(Image.new("L", (1, 1))).textbbox((0, 0), text, font=font(size))
     image = Image.new("L", (int(right - left) + 2 * PLATE_PX, int(bottom - top) + 2 * PLATE_PX))
     ImageDraw.Draw(image).text((PLATE_PX - left, PLATE_PX - top), text, fill=255, font=font(size))
@@ -55,7 +55,7 @@ def _coverage(text: str, size: int) -> np.ndarray:
 
 
 def written_size(text: str, size: int) -> tuple[int, int]:
-    """Return width and height of a text as ``write`` draws it [pixels]."""
+    """Width and height of a text as ``write`` draws it [pixels]."""
     rows, columns, _ = _coverage(text, size).shape
     return columns, rows
 

@@ -32,7 +32,7 @@ class TransducerShape(NamedTuple):
 
 
 def _prism(profile: np.ndarray, width: float, colour) -> TransducerShape:
-    """Return the convex prism of a profile (n, 2) of x and z, centred on y = 0; each triangle has its own
+    """The convex prism of a profile (n, 2) of x and z, centred on y = 0; each triangle has its own
     vertices.
     """
     ends = [np.insert(profile, 1, y, axis=1) for y in (-width / 2, width / 2)]
@@ -46,8 +46,8 @@ def _rectangle(left: float, right: float, bottom: float, top: float) -> np.ndarr
 
 
 def transducer(size, radius: float = 0.0) -> TransducerShape:
-    """Return the housing, its acoustic lens, flat or an arc of a radius, and a marker on the +x side."""
-    x, y, z = (float(each) for each in size)
+    """The housing, its acoustic lens, flat or an arc of a radius, and a marker on the +x side."""
+    x, y, z = (float(length) for length in size)
     lens = min(LENS_MM, z / 4)
     face = _face(x, z, radius)
     top = face[:, 1].max() + lens
@@ -60,11 +60,11 @@ def transducer(size, radius: float = 0.0) -> TransducerShape:
             _rectangle(x / 2 - 0.25, x / 2 + 0.25, middle - 0.225 * z, middle + 0.225 * z), 0.3 * y, MARKER
         ),
     ]
-    return TransducerShape(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+    return TransducerShape(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 def _face(x: float, z: float, radius: float) -> np.ndarray:
-    """Return the profile (n, 2) of the array face from -x to +x, lowest in its centre at -z / 2."""
+    """The profile (n, 2) of the array face from -x to +x, lowest in its centre at -z / 2."""
     if radius == 0:
         return np.array([[-x / 2, -z / 2], [x / 2, -z / 2]])
     across = np.linspace(-x / 2, x / 2, ARC_POINTS)
@@ -72,32 +72,32 @@ def _face(x: float, z: float, radius: float) -> np.ndarray:
 
 
 def edges(size, radius: float = 0.0) -> np.ndarray:
-    """Return the end points of the housing's straight edges, shape (24, 3), just outside so that the sides
-    do not hide them.
+    """The end points of the housing's straight edges, shape (24, 3), just outside so that the sides do not
+    hide them.
     """
-    x, y, z = (float(each) for each in size)
+    x, y, z = (float(length) for length in size)
     foot = _face(x, z, radius)[:, 1].max()
     box = np.array([x, y, z / 2 - foot])
     return (_CORNERS * (box + 0.15) + [0.0, 0.0, (z / 2 + foot) / 2])[_EDGES].reshape(-1, 3)
 
 
 def image_plane_grid(rows: int, columns: int) -> np.ndarray:
-    """Return a grid of the image, row by row: fractions (rows * columns, 2) of scanline and depth."""
+    """A grid of the image, row by row: fractions (rows * columns, 2) of scanline and depth."""
     down, across = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, columns), indexing="ij")
     return np.stack([across, down], axis=-1).reshape(-1, 2)
 
 
 def grid_triangles(rows: int, columns: int) -> np.ndarray:
-    """Return the vertex indices of two triangles in each cell of a grid, int32, shape ((rows - 1)(columns
-    - 1), 6).
+    """The vertex indices of two triangles in each cell of a grid, int32, shape ((rows - 1)(columns - 1),
+    6).
     """
     first = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1, 1)
     return (first + [0, columns, 1, 1, columns, columns + 1]).astype(np.int32)
 
 
 def on_plane(shares: np.ndarray, view: View) -> np.ndarray:
-    """Return points (n, 2) on the image plane [mm] of fractions (n, 2) of scanline and depth: in a
-    rectangle or a sector.
+    """Points (n, 2) on the image plane [mm] of fractions (n, 2) of scanline and depth: in a rectangle or a
+    sector.
     """
     if view.sector is None:
         return (shares - [0.5, 0.0]) * [view.width_mm, view.depth_mm]
@@ -108,14 +108,12 @@ def on_plane(shares: np.ndarray, view: View) -> np.ndarray:
 
 
 def on_transducer(places: np.ndarray) -> np.ndarray:
-    """Return points (n, 3) of image plane points (n, 2); the origin is the centre of the face, depth is
-    along -z.
-    """
+    """Points (n, 3) of image plane points (n, 2); the origin is the centre of the face, depth is along -z."""
     return np.column_stack([places[:, 0], np.zeros(len(places)), -places[:, 1]])
 
 
 def image_plane_frame(view: View) -> np.ndarray:
-    """Return the end points of the sides of the image plane, shape (2 FRAME_SIDES, 3), just outside of it."""
+    """The end points of the sides of the image plane, shape (2 FRAME_SIDES, 3), just outside of it."""
     quarter = np.linspace(0, 1, FRAME_SIDES // 4, endpoint=False)
     low, high = np.full_like(quarter, -0.008), np.full_like(quarter, 1.008)
     sides = [(quarter, low), (high, quarter), (1 - quarter, high), (low, 1 - quarter)]
@@ -124,7 +122,7 @@ def image_plane_frame(view: View) -> np.ndarray:
 
 
 def sampled(picture: np.ndarray, places: np.ndarray, view: View) -> np.ndarray:
-    """Return grey values (n,) in [0, 1] of an image at points (n, 2) of its plane [mm]."""
+    """Grey values (n,) in [0, 1] of an image at points (n, 2) of its plane [mm]."""
     share = (places + [view.width_mm / 2, view.above_mm]) / [view.width_mm, view.depth_mm]
     size = np.array(picture.shape[::-1])
     column, row = np.clip(np.floor(share * size), 0, size - 1).astype(np.intp).T
@@ -132,5 +130,5 @@ def sampled(picture: np.ndarray, places: np.ndarray, view: View) -> np.ndarray:
 
 
 def placed(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return world points (n, 3) of local ones at a rigid pose (4, 4)."""
+    """World points (n, 3) of local ones at a rigid pose (4, 4)."""
     return points @ pose[:3, :3].T + pose[:3, 3]

@@ -26,24 +26,24 @@ Written = tuple[str, int, tuple[int, int, int]]
 
 
 def image_boxes(layout: WindowLayout, view: View) -> list[Rect]:
-    """Return the boxes of a view's images."""
+    """The boxes of a view's images."""
     return layout.image_boxes(len(view.images), view.width_mm, view.depth_mm)
 
 
 def to_pixels(view: View, box: Rect, places_mm: np.ndarray) -> np.ndarray:
-    """Return columns and rows (..., 2), fractional, of points (..., 2) of the plane."""
+    """Columns and rows (..., 2), fractional, of points (..., 2) of the plane."""
     share = (places_mm + [view.width_mm / 2, view.above_mm]) / [view.width_mm, view.depth_mm]
     return share * [box.width, box.height] + [box.left, box.top]
 
 
 def to_plane(view: View, box: Rect, column: float, row: float) -> tuple[float, float]:
-    """Return the point of the plane [mm] at a pixel."""
+    """The point of the plane [mm] at a pixel."""
     across, down = (column - box.left) / box.width, (row - box.top) / box.height
     return (across - 0.5) * view.width_mm, down * view.depth_mm - view.above_mm
 
 
 def ruler_ticks(view: View, box: Rect) -> list[tuple[int, int | None]]:
-    """Return ticks every 5 mm of depth: (row in pixels, whole centimetres or None between them)."""
+    """Ticks every 5 mm of depth: (row in pixels, whole centimetres or None between them)."""
     ticks = []
     for half_cm in range(int((view.depth_mm - view.above_mm) / 5.0 + 1e-9) + 1):
         share = (view.above_mm + half_cm * 5.0) / view.depth_mm
@@ -106,8 +106,8 @@ def draw_caliper(page: np.ndarray, layout: WindowLayout, view: View, box: Rect) 
 def beside(
     start: np.ndarray, end: np.ndarray, size: tuple[int, int], box: Rect, gap: int
 ) -> tuple[float, float]:
-    """Return the centre of a text of a size [pixels] beside a line, ``gap`` away, on the side towards the
-    centre of the box.
+    """The centre of a text of a size [pixels] beside a line, ``gap`` away, on the side towards the centre of
+    the box.
     """
     along = (end - start) / max(float(np.linalg.norm(end - start)), 1.0)
     across = np.array([along[1], -along[0]]) if along.any() else np.array([1.0, 0.0])
@@ -141,7 +141,7 @@ def draw_panel(draw: ImageDraw.ImageDraw, layout: WindowLayout, view: View) -> N
 
 
 def status_image(layout: WindowLayout, status: str) -> np.ndarray:
-    """Return the status over the images, uint8, shape of layout.status."""
+    """The status over the images, uint8, shape of layout.status."""
     box, px = layout.status, layout.px
     image = Image.new("RGB", (box.width, box.height), PANEL)
     text = shortened(status, px(17), box.width)

@@ -22,7 +22,7 @@ class VulkanDevice(NamedTuple):
 
 @cache
 def vulkan_devices() -> tuple[VulkanDevice, ...]:
-    """Return the devices; none where the loader is missing or has another interface."""
+    """The devices; none where the loader is missing or has another interface."""
     try:
         vulkan = ctypes.CDLL(LOADERS.get(sys.platform, "libvulkan.so.1"))
     except OSError:

@@ -51,21 +51,15 @@ class NoVulkan(RuntimeError):
 class Window(Generic[UserSettings]):
     """A window on GGUI. The loop is: while running: read_controls, step, draw.
 
-    `ti.init` comes before it, and one window is open at a time.
+    `ti.init` comes before it, and one window is open at a time. ``geometry`` is the fixed geometry of the
+    scene; without it the window shows progress until `show_scene`. ``settings`` are what the user changes,
+    shown by the sliders; ``size`` is width and height [pixels]; ``keys`` are the assignment of keys, and a
+    ``gamepad`` is read beside mouse and keys. A ``visible`` window is a real one, at most FRAMES_A_SECOND;
+    else it is off-screen, drawn only by `picture`. With ``by_processor`` the 3D view is drawn by our own
+    kernels on the processor; None: where no graphics card draws.
 
-    Args:
-        geometry: fixed geometry of the scene; without it the window shows progress until `show_scene`.
-        settings: what the user changes, shown by the sliders.
-        size: width, height in pixels.
-        visible: a real window, at most FRAMES_A_SECOND; else off-screen, drawn only by `picture`.
-        keys: assignment of keys.
-        gamepad: read beside mouse and keys, if given.
-        by_processor: the 3D view is drawn by our own kernels on the processor; None where no graphics card
-        draws.
-
-    Raises:
-        NoVulkan: no Vulkan loader, driver or device.
-        RuntimeError: a visible window without a display.
+    Raises NoVulkan where there is no Vulkan loader, driver or device, and RuntimeError where a visible window
+    has no display.
     """
 
     def __init__(
@@ -204,7 +198,7 @@ class Window(Generic[UserSettings]):
         return self.layout.scene.contains(*place) and not any(box.contains(*place) for box in over)
 
     def _boxes_over_scene(self) -> list[Rect]:
-        """Return the boxes of the background image that cover the 3D view."""
+        """The boxes of the background image that cover the 3D view."""
         if self._help_shown:
             return [self.layout.whole]
         if self._view is None:
@@ -212,7 +206,7 @@ class Window(Generic[UserSettings]):
         return self._background.boxes_over_scene(self._view)
 
     def _pixel(self, cursor: np.ndarray) -> tuple[float, float]:
-        """Return column and row at window coordinates."""
+        """Column and row at window coordinates."""
         return cursor[0] * self.layout.width, (1 - cursor[1]) * self.layout.height
 
     def _read_events(self, controls: Controls) -> None:
@@ -286,7 +280,7 @@ class Window(Generic[UserSettings]):
             self._update_size()
 
     def picture(self) -> np.ndarray:
-        """Return the last view drawn, uint8, shape (height, width, 3).
+        """The last view drawn, uint8, shape (height, width, 3).
 
         Raises RuntimeError if nothing was drawn.
         """

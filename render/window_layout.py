@@ -35,7 +35,7 @@ class Rect(NamedTuple):
     height: int
 
     def widened(self, by: int) -> "Rect":
-        """Return the box with so many pixels around it."""
+        """The box with so many pixels around it."""
         return Rect(self.left - by, self.top - by, self.width + 2 * by, self.height + 2 * by)
 
     @property
@@ -70,7 +70,7 @@ class WindowLayout:
         return float(np.clip(share, LEAST_SCALE, MOST_SCALE))
 
     def px(self, pixels: float) -> int:
-        """Return a length in this window of one in a window of FULL_SIZE [pixels]."""
+        """A length in this window of one in a window of FULL_SIZE [pixels]."""
         return round(self.scale * pixels)
 
     @property
@@ -148,12 +148,12 @@ class WindowLayout:
         return max(0, room // self.px(FIGURE_HEIGHT))
 
     def findings(self, count: int) -> Rect:
-        """Return the box of this many findings, over the 3D view's upper left corner."""
+        """The box of this many findings, over the 3D view's upper left corner."""
         gap, height = self.px(FINDINGS_GAP), count * self.px(FIGURE_HEIGHT) + 2 * self.figures_pad
         return Rect(gap, self.scene.top + gap, self.px(FINDINGS_WIDTH), height)
 
     def sliders(self, widths: list[float]) -> list[Rect]:
-        """Return boxes for groups of sliders, side by side in the strip, in proportion to `widths`."""
+        """Boxes for groups of sliders, side by side in the strip, in proportion to `widths`."""
         edges = np.concatenate([[0.0], np.cumsum(widths)]) / sum(widths) * self.slider_room(len(widths))
         gap = self.px(STRIP_GAP)
         return [
@@ -167,12 +167,12 @@ class WindowLayout:
         ]
 
     def slider_room(self, count: int) -> int:
-        """Return the total width of this many boxes of sliders [pixels]."""
+        """The total width of this many boxes of sliders [pixels]."""
         return self.readouts.left - self.px(STRIP_GAP) * (count + 1)
 
     def scanner_sliders(self, sizes: list[tuple[int, int]]) -> list[Rect]:
-        """Return boxes of these widths and heights beside the panel: one under the other, and where there is
-        no more room, in a further column.
+        """Boxes of these widths and heights beside the panel: one under the other, and where there is no more
+        room, in a further column.
         """
         gap = self.px(SCANNER_GAP)
         right, first, room = self.scene.right - gap, self.scene.top + gap, self.scene.height - 2 * gap
@@ -190,8 +190,8 @@ class WindowLayout:
         return Rect(0, 0, self.width, self.height)
 
     def image_boxes(self, count: int, width_mm: float, depth_mm: float) -> list[Rect]:
-        """Return the largest boxes in the panel with the shape of the image plane, side by side or one under
-        the other.
+        """The largest boxes in the panel with the shape of the image plane, side by side or one under the
+        other.
 
         Raises ValueError unless both lengths are positive.
         """
@@ -215,8 +215,8 @@ class WindowLayout:
         ]
 
     def window_coordinates(self, rect: Rect) -> tuple[float, float, float, float]:
-        """Return left, bottom, right, top with (0, 0) at the bottom left and (1, 1) at the top right of
-        the window.
+        """Left, bottom, right, top with (0, 0) at the bottom left and (1, 1) at the top right of the
+        window.
         """
         return (
             rect.left / self.width,

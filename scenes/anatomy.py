@@ -81,13 +81,13 @@ def fingerprint(anatomy: LoadedAnatomy) -> str:
     parts = [anatomy.parts[name] for name in sorted(anatomy.parts)]
     arrays: tuple[np.ndarray, ...]
     volumes = anatomy.ct, anatomy.labels, *([anatomy.corrections] if anatomy.corrections else [])
-    for each in (anatomy.organ, anatomy.tumour, *parts, *volumes, *anatomy.shapes):
-        if isinstance(each, trimesh.Trimesh):
-            arrays = each.vertices, each.faces
-        elif isinstance(each, Grid):
-            arrays = each.voxels, each.index_from_mm
+    for geometry in (anatomy.organ, anatomy.tumour, *parts, *volumes, *anatomy.shapes):
+        if isinstance(geometry, trimesh.Trimesh):
+            arrays = geometry.vertices, geometry.faces
+        elif isinstance(geometry, Grid):
+            arrays = geometry.voxels, geometry.index_from_mm
         else:
-            digest.update(repr(each).encode())
+            digest.update(repr(geometry).encode())
             continue
         for array in arrays:
             digest.update(np.ascontiguousarray(array).data.cast("B"))

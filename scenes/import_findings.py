@@ -78,12 +78,12 @@ class ImportFindings(Section):
     @property
     def open_warnings(self) -> tuple[str, ...]:
         """The warnings that nobody has acknowledged."""
-        return tuple(each.text for each in self.warnings if not each.acknowledged)
+        return tuple(warning.text for warning in self.warnings if not warning.acknowledged)
 
     @property
     def acknowledged_warnings(self) -> tuple[str, ...]:
         """The warnings that the user has acknowledged."""
-        return tuple(each.text for each in self.warnings if each.acknowledged)
+        return tuple(warning.text for warning in self.warnings if warning.acknowledged)
 
 
 def findings_text(findings: ImportFindings) -> str:
@@ -139,8 +139,8 @@ def acknowledge(folder: Path, shown: Collection[str]) -> None:
     findings = read_findings(folder)
     if findings is not None:
         checked = tuple(
-            each.model_copy(update=dict(acknowledged=each.acknowledged or each.text in shown))
-            for each in findings.warnings
+            warning.model_copy(update=dict(acknowledged=warning.acknowledged or warning.text in shown))
+            for warning in findings.warnings
         )
         with atomic_write(folder / FINDINGS_FILE) as partial:
             partial.write_text(findings_text(findings.model_copy(update=dict(warnings=checked))), "utf-8")

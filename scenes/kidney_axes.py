@@ -75,16 +75,12 @@ def kidney_axes(
     parts: dict[str, trimesh.Trimesh],
     hilum_mm: Sequence[float] | None = None,
 ) -> KidneyAxes:
-    """The axes of a kidney.
+    """The axes of a kidney, whose surface ``organ`` [mm, LPS] includes its tumours and cysts.
 
     The polar axis is the axis of least inertia of the contour. The hilum is the surface that opens into the
-    labelled sinus, or else the mouth of the concavity near ``hilum_mm``.
-
-    Args:
-        organ: surface [mm, LPS] with its tumours and cysts.
-        lesions: surfaces of tumours and cysts; their part of the organ's surface is left out.
-        parts: surfaces of sinus, collecting system ("urine") and vessels ("vessel"), where labelled.
-        hilum_mm: a point (3,) at the hilum.
+    labelled sinus, or else the mouth of the concavity near ``hilum_mm`` (3,). ``lesions`` are surfaces of
+    tumours and cysts; their part of the organ's surface is left out. ``parts`` are the surfaces of sinus,
+    collecting system ("urine") and vessels ("vessel"), where labelled.
     """
     own = _off_lesions(organ, lesions)
     contour = trimesh.convex.convex_hull(organ.vertices[own])

@@ -50,11 +50,11 @@ class NephrometryScore:
 
     @property
     def least(self) -> int:
-        return sum(min(each.points) for each in self.components)
+        return sum(min(component.points) for component in self.components)
 
     @property
     def most(self) -> int:
-        return sum(max(each.points) for each in self.components)
+        return sum(max(component.points) for component in self.components)
 
     @property
     def complexity(self) -> str:

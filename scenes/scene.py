@@ -313,7 +313,7 @@ class Scene(Section):
                 "attachment.radius_mm and fat_kpa_mm hold nodes: {}, or them to 0",
             ),
         ):
-            able = [name for name, each in TISSUES.items() if getattr(each, f"supports_{support}")]
+            able = [name for name, tissue in TISSUES.items() if getattr(tissue, f"supports_{support}")]
             if wanted and self.tissue.model not in able:
                 raise ValueError(refusal.format(f"set tissue.model to {' or '.join(able)}"))
         return self
@@ -399,8 +399,8 @@ def with_options(scene: Scene, options: Mapping[str, float | int | str | None]) 
     and for values of two models.
     """
     values = scene.model_dump(exclude_unset=True)
-    asked = [name.removeprefix("tissue.") for name, value in options.items() if value is not None]
-    model = str(options.get("tissue.model") or model_with(asked, scene.tissue.model))
+    changed = [name.removeprefix("tissue.") for name, value in options.items() if value is not None]
+    model = str(options.get("tissue.model") or model_with(changed, scene.tissue.model))
     if model != scene.tissue.model:
         values["tissue"] = {"model": model}
         if not TISSUES[model].supports_attachment:

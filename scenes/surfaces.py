@@ -101,15 +101,15 @@ def file_comments(path: Path) -> list[str]:
 def stated_space(path: Path) -> Space | None:
     """The coordinate system that a surface file states as 3D Slicer does, or None.
 
-    Raises PatientError: two, or another.
+    Raises PatientError where it states two, or another.
     """
-    found = {name for text in file_comments(path) for name in SPACE_FIELD.findall(text)}
-    if len(found) > 1 or not found <= {"LPS", "RAS"}:
+    spaces = {name for text in file_comments(path) for name in SPACE_FIELD.findall(text)}
+    if len(spaces) > 1 or not spaces <= {"LPS", "RAS"}:
         raise PatientError(
-            f"{path}: states SPACE={' and SPACE='.join(sorted(found))}; expected LPS or RAS; export it again "
-            "from 3D Slicer"
+            f"{path}: states SPACE={' and SPACE='.join(sorted(spaces))}; expected LPS or RAS; export it "
+            "again from 3D Slicer"
         )
-    return cast(Space, found.pop()) if found else None
+    return cast(Space, spaces.pop()) if spaces else None
 
 
 def in_lps(surface: trimesh.Trimesh, space: Space | None) -> trimesh.Trimesh:

@@ -59,14 +59,12 @@ def tumour_anatomy(
     tissues: dict[int, str] | None = None,
     hilum_mm: tuple[float, float, float] | None = None,
 ) -> TumourAnatomy:
-    """Measure the largest tumour of a kidney. All surfaces are closed, in LPS [mm].
+    """The measures of the largest tumour of a kidney. All surfaces are closed, in LPS [mm].
 
-    Args:
-        organ: with its tumours and cysts.
-        tumour: of one tumour or several, apart from each other.
-        parts: surfaces of other parts by tissue: sinus, urine (collecting system), vessel, cyst.
-        labels: voxels whose values ``tissues`` names; they alone distinguish arteries from veins.
-        hilum_mm: a point at the hilum, for where no sinus is labelled.
+    ``organ`` includes its tumours and cysts; ``tumour`` is of one or several, apart from each other.
+    ``parts`` are the surfaces of other parts by tissue: sinus, urine (collecting system), vessel, cyst.
+    ``labels`` are voxels whose values ``tissues`` names; they alone distinguish arteries from veins.
+    ``hilum_mm`` is a point at the hilum, for where no sinus is labelled.
     """
     bodies = sorted(tumour.split(only_watertight=False), key=lambda body: abs(body.volume))
     largest = bodies[-1]
@@ -85,7 +83,7 @@ def tumour_anatomy(
         volume_ml=float(largest.volume) / 1000,
         exophytic_share=exophytic_share(points, axes.contour),
         contact_cm2=contact_mm2(organ, largest) / 100,
-        distance_mm={tissue: surface_distance_mm(largest, each) for tissue, each in surfaces.items()}
+        distance_mm={tissue: surface_distance_mm(largest, surface) for tissue, surface in surfaces.items()}
         | {kind: voxel_distance_mm(largest, vessel) for kind, vessel in vessels.items()},
         touches_main_vessel=touches_main_vessel(largest, vessels),
         axes=axes,
@@ -136,7 +134,7 @@ def vessels_of(labels: Grid | None, tissues: dict[int, str]) -> dict[str, Grid]:
     if labels is None:
         return {}
     codes = {kind: [code for code, tissue in tissues.items() if tissue == kind] for kind in MAIN_DIAMETER_MM}
-    masks = {kind: np.isin(labels.voxels, found) for kind, found in codes.items() if found}
+    masks = {kind: np.isin(labels.voxels, values) for kind, values in codes.items() if values}
     return {kind: Grid(mask, labels.index_from_mm) for kind, mask in masks.items() if mask.any()}
 
 
@@ -170,9 +168,9 @@ def main_vessel_gap_mm(tumour: trimesh.Trimesh, vessel: Grid, least_diameter_mm:
     This part is the union of the balls inside the label that have this diameter.
     """
     corners = np.array(np.meshgrid(*(tumour.bounds + [[-AROUND_MM], [AROUND_MM]]).T)).reshape(3, -1).T
-    found = corners @ vessel.index_from_mm[:3, :3].T + vessel.index_from_mm[:3, 3]
-    first = np.clip(np.floor(found.min(axis=0)), 0, vessel.voxels.shape).astype(int)
-    last = np.clip(np.ceil(found.max(axis=0)) + 1, first, vessel.voxels.shape).astype(int)
+    indices = corners @ vessel.index_from_mm[:3, :3].T + vessel.index_from_mm[:3, 3]
+    first = np.clip(np.floor(indices.min(axis=0)), 0, vessel.voxels.shape).astype(int)
+    last = np.clip(np.ceil(indices.max(axis=0)) + 1, first, vessel.voxels.shape).astype(int)
     near = vessel.voxels[tuple(slice(a, b) for a, b in zip(first, last, strict=True))]
     if not near.any():
         return np.inf

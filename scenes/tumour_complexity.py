@@ -23,20 +23,20 @@ class Complexity:
     @property
     def estimated(self) -> list[str]:
         """What depends on the hilar concavity, because no sinus is labelled."""
-        names = [each.name for each in self._components if each.estimated]
+        names = [component.name for component in self._components if component.estimated]
         return names + (["a/p"] if self.tumour.axes.estimated and face_of(self.tumour) else [])
 
     @property
     def not_known(self) -> list[str]:
         """What the labels leave open."""
-        names = [each.name for each in self._components if each.needs]
+        names = [component.name for component in self._components if component.needs]
         names += [] if face_of(self.tumour) else ["a/p"]
         return names + (["h"] if self.tumour.touches_main_vessel is None else [])
 
     @property
     def labels_needed(self) -> list[str]:
         """The structures whose labels would show what is not known."""
-        needed = [name for each in self._components for name in each.needs]
+        needed = [name for component in self._components for name in component.needs]
         needed += ["renal artery and vein"] if self.tumour.touches_main_vessel is None else []
         return list(dict.fromkeys(needed))
 
@@ -49,7 +49,7 @@ class Complexity:
         tumour = self.tumour
         share, several = 100 * tumour.exophytic_share, f"; largest of {tumour.tumours} tumours"
         size = f"{tumour.diameter_mm:.0f} mm, {share:.0f} % exophytic, contact {tumour.contact_cm2:.1f} cm2"
-        near = ", ".join(f"{WORD.get(each, each)} {mm:.1f}" for each, mm in tumour.distance_mm.items())
+        near = ", ".join(f"{WORD.get(tissue, tissue)} {mm:.1f}" for tissue, mm in tumour.distance_mm.items())
         rows = [
             ("size", size + (several if tumour.tumours > 1 else "")),
             ("distance", f"{near} mm"),
@@ -70,7 +70,9 @@ class Complexity:
             volume_ml=round(tumour.volume_ml, DIGITS),
             exophytic_share=round(tumour.exophytic_share, DIGITS),
             contact_cm2=round(tumour.contact_cm2, DIGITS),
-            distance_mm={WORD.get(each, each): round(mm, DIGITS) for each, mm in tumour.distance_mm.items()},
+            distance_mm={
+                WORD.get(tissue, tissue): round(mm, DIGITS) for tissue, mm in tumour.distance_mm.items()
+            },
             touches_main_vessel=tumour.touches_main_vessel,
             renal=_figures(self.renal),
             padua=_figures(self.padua),
@@ -95,16 +97,16 @@ def complexity(anatomy: LoadedAnatomy, hilum_mm: Vector3 | None) -> Complexity |
 
 def _in_words(score: NephrometryScore, measures: bool) -> str:
     return f"{score}, {score.complexity}: " + ", ".join(
-        _component(each, measures) for each in score.components
+        _component(component, measures) for component in score.components
     )
 
 
-def _component(each: Component, measures: bool) -> str:
-    points = "-".join(str(n) for n in sorted({each.points[0], each.points[-1]}))
-    if each.measure is None or not measures:
-        return f"{each.name} {points}"
-    measure = f"{each.measure:.1f} mm" if each.unit == "mm" else f"{100 * each.measure:.0f} %"
-    return f"{each.name} {points} ({measure})"
+def _component(component: Component, measures: bool) -> str:
+    points = "-".join(str(n) for n in sorted({component.points[0], component.points[-1]}))
+    if component.measure is None or not measures:
+        return f"{component.name} {points}"
+    measure = f"{component.measure:.1f} mm" if component.unit == "mm" else f"{100 * component.measure:.0f} %"
+    return f"{component.name} {points} ({measure})"
 
 
 def _figures(score: NephrometryScore) -> dict[str, Any]:
@@ -114,12 +116,12 @@ def _figures(score: NephrometryScore) -> dict[str, Any]:
         suffix=score.suffix,
         complexity=score.complexity,
         components={
-            each.name: dict(
-                points=list(each.points),
-                measure=None if each.measure is None else round(each.measure, DIGITS),
-                unit=each.unit,
-                estimated=each.estimated,
+            component.name: dict(
+                points=list(component.points),
+                measure=None if component.measure is None else round(component.measure, DIGITS),
+                unit=component.unit,
+                estimated=component.estimated,
             )
-            for each in score.components
+            for component in score.components
         },
     )

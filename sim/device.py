@@ -33,8 +33,8 @@ def start(arch: str = "cpu", accepts_wrong_results: bool = False, **options) -> 
     global _started
     if arch == "auto":
         arch = "cuda" if taichi_internals.is_supported(ti.cuda) else "cpu"
-    asked = arch, options
-    if _started == (taichi_internals.program(), *asked):
+    configuration = arch, options
+    if _started == (taichi_internals.program(), *configuration):
         return arch
     ti.set_logging_level(ti.ERROR)
     if arch != "cpu" and not is_available(arch):
@@ -55,7 +55,7 @@ def start(arch: str = "cpu", accepts_wrong_results: bool = False, **options) -> 
             "the Vulkan driver of this machine gives wrong results, as Mesa 22's software driver does; use "
             "--arch cpu, or a newer driver"
         )
-    _started = taichi_internals.program(), *asked
+    _started = taichi_internals.program(), *configuration
     return arch
 
 

@@ -155,7 +155,7 @@ class DivergenceCheck:
         if self.state.is_restored:
             state, where = self.initial, "as it was at the start"
         still = replace(state.body, velocity=np.zeros_like(state.body.velocity))
-        self.solver.restore(SolverState(still, state.history))
+        self.solver.restore(SolverState(still, state.internal_state))
         self.state = DivergenceState(state, is_restored=True)
         self.restorations += 1
         return f"State restored, {where}: {fault}"
@@ -185,8 +185,8 @@ class DivergenceCheck:
             for t in range(self.count):
                 if self.is_tangled(t):
                     self.faults[None][1] += 1
-        found = self.faults[None]
-        return tm.vec3(found.x, found.y, self.farthest[None])
+        counts = self.faults[None]
+        return tm.vec3(counts.x, counts.y, self.farthest[None])
 
     @ti.func
     def is_tangled(self, t):

@@ -38,8 +38,8 @@ class kernel:
         functools.update_wrapper(self, function)
         self._taichi = taichi_internals.kernel_of(function)
         self._parameters = taichi_internals.parameters_of(self._taichi)
-        self._templates = [at for at, each in enumerate(self._parameters) if each.kind is None]
-        self._own = [at for at, each in enumerate(self._parameters) if each.kind is not None]
+        self._templates = [at for at, parameter in enumerate(self._parameters) if parameter.kind is None]
+        self._own = [at for at, parameter in enumerate(self._parameters) if parameter.kind is not None]
         self._program: Any = None
         self._compiled: list[_Compiled] = []
 
@@ -48,14 +48,20 @@ class kernel:
 
     def __call__(self, *values: Any, **named: Any) -> Any:
         if named:
-            values += tuple(named[each.name] for each in self._parameters[len(values) :])
+            values += tuple(named[parameter.name] for parameter in self._parameters[len(values) :])
         program = taichi_internals.program()
         if self._program is not program:
             self._program, self._compiled = program, []
         objects = tuple([values[at] for at in self._templates])
         calls = objects[0].__dict__.setdefault("_calls", {})
         # A call stays with the object: so its fields are freed with it.
-        key = self, *[each if isinstance(each, int | float | str) else id(each) for each in objects[1:]]
+        key = (
+            self,
+            *[
+                argument if isinstance(argument, int | float | str) else id(argument)
+                for argument in objects[1:]
+            ],
+        )
         call = calls.get(key)
         if call is None or call.program is not program or not call.update():
             call = calls[key] = _Call(self._compiled_for(objects, values), objects)
@@ -93,7 +99,7 @@ class function:
         trace = _Trace(taichi_internals.declared_in_function)
 
         def read() -> None:
-            own = [taichi_internals.in_function(each) for each in values]
+            own = [taichi_internals.in_function(argument) for argument in values]
             self._inline(trace.value(path, value), *own)
 
         compiled = taichi_internals.add_function(self._inline, read)
@@ -112,12 +118,12 @@ class _Compiled:
         trace = _Trace(taichi_internals.declared)
         places = count()
         traced = [
-            trace.parameter(f"objects[{next(places)}]", value) if each.kind is None else value
-            for each, value in zip(parameters, values, strict=True)
+            trace.parameter(f"objects[{next(places)}]", value) if parameter.kind is None else value
+            for parameter, value in zip(parameters, values, strict=True)
         ]
         self.kernel = taichi_internals.compiled(taichi, number, traced)
         # Of the method's own parameters, which come before what the code reads of the objects.
-        self.own = [each.kind for each in parameters if each.kind is not None]
+        self.own = [parameter.kind for parameter in parameters if parameter.kind is not None]
         self.kinds = [_kind(value) for _, value in trace.arguments]
         self._wanted = tuple(value for _, value in trace.constants)
         self._constants = _reader([path for path, _ in trace.constants])
@@ -199,7 +205,7 @@ class _Trace:
             return value
         if isinstance(value, list | tuple):
             self.constants.append((f"len({path})", len(value)))
-            return type(value)(self.value(f"{path}[{k}]", each) for k, each in enumerate(value))
+            return type(value)(self.value(f"{path}[{k}]", item) for k, item in enumerate(value))
         if isinstance(value, Field):
             return _TracedField(self, path, value)
         if _kind(value) is None:

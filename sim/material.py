@@ -55,6 +55,6 @@ def mixture(
     materials = (outside, *parts)
     shares = np.column_stack([1 - share.sum(axis=1), share])
     mu, lambda_, density = (
-        shares @ [getattr(each, name) for each in materials] for name in ("mu", "lambda_", "density")
+        shares @ [getattr(material, name) for material in materials] for name in ("mu", "lambda_", "density")
     )
     return mu, lambda_, density

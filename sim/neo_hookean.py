@@ -145,10 +145,10 @@ class NeoHookean:
         self.has_capsule = capsule is not None
         self.count = len(lattice.cells)
         self.has_relaxation = bool(prony)
-        self.history: dict[str, Field] = {}
+        self.internal_state: dict[str, Field] = {}
         if prony:
             self.relaxation = Relaxation(prony, self.count)
-            self.history = self.relaxation.state
+            self.internal_state = self.relaxation.state
         self.most_mm = MOST_CELLS_AN_ITERATION * lattice.cell_mm
         self.mu = self.lambda_ = 0.0
         self.inertial_target = zeros(body.count, 3, within=1)
@@ -240,7 +240,7 @@ class NeoHookean:
         else:
             self._fill_stiffness(np.ones(self.count))
         if self._whole_tether is not None:
-            volume = [each.node_mass(np.ones(self.count)) for each in (self.lattice, whole)]
+            volume = [lattice.node_mass(np.ones(self.count)) for lattice in (self.lattice, whole)]
             self.set_tether(self._whole_tether * np.minimum(volume[0] / volume[1], 1.0))
         if self._whole_points is not None:
             spacing_mm = POINT_SPACING_CELLS * whole.cell_mm
@@ -393,7 +393,7 @@ class NeoHookean:
             pressure = (lambda_ * (ln(at) + j * one_by - 1.0) - mu) * one_by
             force -= b.w * (mu * (b.x * f1 + b.y * f2 + b.z * f3) + pressure * g)
             if ti.static(self.has_relaxation):
-                past = times(self.relaxation.history[self.around[8 * i + k]], b.xyz)
+                past = times(self.relaxation.past_stress[self.around[8 * i + k]], b.xyz)
                 force -= b.w * (past.x * f1 + past.y * f2 + past.z * f3)
                 isotropic += ti.max(b.w * past.dot(b.xyz), 0.0)
             curvature = lambda_ * one_by * one_by - (pressure * one_by if j > LEAST_J else 0.0)

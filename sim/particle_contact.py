@@ -27,11 +27,11 @@ class ShapeContacts:
     """Contact planes of each particle with each shape, and the displacements by contact in this substep.
 
     ``plane`` (n, shapes): normal and offset of the nearest surface, n . x = offset [mm]; that of a static
-    shape is reused while the particle is near to where it was ``found`` (n, shapes), a point and its distance
-    [mm]. ``touched`` (n,): bits of the shapes that may be touched in this substep. ``push`` (n, shapes):
-    displacement by friction (x, y, z) and along the normal (w) so far [mm]. The clusters conserve momentum,
-    so the sums of the displacements are the impulses exchanged with the shape, and Coulomb's law applies to
-    them: |friction| <= coefficient * normal. With coefficient 0, ``push`` does not exist.
+    shape is reused while the particle is near to the ``last_query`` (n, shapes) of its distance: point and
+    distance [mm]. ``touched`` (n,): bits of the shapes that may be touched in this substep. ``push`` (n,
+    shapes): displacement by friction (x, y, z) and along the normal (w) so far [mm]. The clusters conserve
+    momentum, so the sums of the displacements are the impulses exchanged with the shape, and Coulomb's law
+    applies to them: |friction| <= coefficient * normal. With coefficient 0, ``push`` does not exist.
     """
 
     def __init__(self, body: ParticleBody, shapes: list, friction: float) -> None:
@@ -48,21 +48,22 @@ class ShapeContacts:
         if self.has_friction:
             self.push = zeros(body.count, len(shapes), 4, within=1)
         self.touched = zeros(body.count, kind=ti.i32)
-        self.found = zeros(body.count, len(shapes), 4, within=1)
+        self.last_query = zeros(body.count, len(shapes), 4, within=1)
         self.reset()
         self.penetration = zeros()
 
     def reset(self) -> None:
         """Clear stored distances; call it after other code has moved the particles."""
-        fill_evenly(self.found, -FAR)
+        fill_evenly(self.last_query, -FAR)
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """A copy of what persists from step to step: contact planes, and where they were found."""
-        return dict(plane=array_of(self.plane), found=array_of(self.found))
+        # Session files name the last query so.
+        return dict(plane=array_of(self.plane), found=array_of(self.last_query))
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Restore a snapshot; the steps that follow give the same bits."""
-        fill((self.plane, state["plane"]), (self.found, state["found"]))
+        fill((self.plane, state["plane"]), (self.last_query, state["found"]))
 
     @ti.func
     def is_clear(self, s: ti.template(), i, p, distance):
@@ -73,7 +74,7 @@ class ShapeContacts:
         if ti.static(self.shapes[s].moves):
             result = self.shapes[s].is_beyond(p, distance)
         else:
-            known = self.found[i, s]
+            known = self.last_query[i, s]
             slack = known.w - distance - SAFETY
             result = slack > 0.0 and (p - known.xyz).norm_sqr() < slack * slack
         return result
@@ -87,9 +88,9 @@ class ShapeContacts:
         if ti.static(self.shapes[s].moves):
             result = self.shapes[s].surface(p)
         else:
-            if (p - self.found[i, s].xyz).norm_sqr() > reuse_mm * reuse_mm:
+            if (p - self.last_query[i, s].xyz).norm_sqr() > reuse_mm * reuse_mm:
                 near = self.shapes[s].surface(p)
-                self.found[i, s] = tm.vec4(p, ti.min(near.w, self.reach))
+                self.last_query[i, s] = tm.vec4(p, ti.min(near.w, self.reach))
                 self.plane[i, s] = tm.vec4(near.xyz, near.xyz.dot(p) - near.w + self.body.contact_radius[i])
             plane = self.plane[i, s]
             result = tm.vec4(plane.xyz, plane.xyz.dot(p) - plane.w + self.body.contact_radius[i])

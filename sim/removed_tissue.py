@@ -51,9 +51,9 @@ class RemovedTissue:
         near = np.asarray(points[gone], float)
         distances = [
             igl.point_mesh_squared_distance(
-                near, np.asarray(each.vertices, float), np.asarray(each.faces, np.int64)
+                near, np.asarray(surface.vertices, float), np.asarray(surface.faces, np.int64)
             )[0]
-            for each in (self.removed, self.remaining)
+            for surface in (self.removed, self.remaining)
         ]
         gone[gone] = distances[0] < distances[1]
         return gone
@@ -69,7 +69,7 @@ def lattice_without(lattice: Lattice, tissue: RemovedTissue, parts: Sequence[tri
     box = _box_around(lattice, tissue.removed)
     grid = np.argwhere(lattice.index_of[box] >= 0)
     cells = lattice.index_of[box][tuple(grid.T)]
-    first = np.array([each.start for each in box])
+    first = np.array([span.start for span in box])
     removed, filled = (
         _filled(lattice, surface, first, lattice.index_of[box].shape)[tuple(grid.T)]
         for surface in (tissue.removed, tissue.remaining)

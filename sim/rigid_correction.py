@@ -218,14 +218,14 @@ class RigidCorrection:
         """Add the blocks' moments; no motion yet."""
         total = no_moments()
         for block in range(self.blocks):
-            each = self.moments.of(block)
-            total.stiffness += each.stiffness
-            total.arm += each.arm
-            total.shift += each.shift
-            total.arm_arm += each.arm_arm
-            total.shift_arm += each.shift_arm
-            total.force += each.force
-            total.torque += each.torque
+            moments = self.moments.of(block)
+            total.stiffness += moments.stiffness
+            total.arm += moments.arm
+            total.shift += moments.shift
+            total.arm_arm += moments.arm_arm
+            total.shift_arm += moments.shift_arm
+            total.force += moments.force
+            total.torque += moments.torque
         self.total_moments.store(0, total)
         self.rotation[None] = tm.eye(3)
         self.translation[None] = tm.vec3(0.0)

@@ -52,16 +52,16 @@ class SelfContacts:
         """Whether two particles have a cluster in common; both rows of clusters ascend."""
         p, q = self.patch[i], self.patch[j]
         a, b = self.model.cluster_start[p], self.model.cluster_start[q]
-        found = 0
-        while a < self.model.cluster_start[p + 1] and b < self.model.cluster_start[q + 1] and found == 0:
+        is_shared = 0
+        while a < self.model.cluster_start[p + 1] and b < self.model.cluster_start[q + 1] and is_shared == 0:
             ca, cb = self.model.cluster_list[a], self.model.cluster_list[b]
             if ca == cb:
-                found = 1
+                is_shared = 1
             elif ca < cb:
                 a += 1
             else:
                 b += 1
-        return found
+        return is_shared
 
     @ti.func
     def find(self):

@@ -150,10 +150,10 @@ def _squares_near(
         low = ti.max(ti.cast(ti.ceil(tm.min(a, b, c) - margin), ti.i32), 0)
         high = ti.min(ti.cast(ti.floor(tm.max(a, b, c) + margin), ti.i32), last)
         for i, j, k in ti.ndrange((low.x, high.x + 1), (low.y, high.y + 1), (low.z, high.z + 1)):
-            found = spacing_mm * spacing_mm * _square_to_triangle(tm.vec3(i, j, k), a, b, c)
+            distance_squared = spacing_mm * spacing_mm * _square_to_triangle(tm.vec3(i, j, k), a, b, c)
             # A minimum does not depend on the order.
-            if found < squared[i, j, k]:
-                ti.atomic_min(squared[i, j, k], found)
+            if distance_squared < squared[i, j, k]:
+                ti.atomic_min(squared[i, j, k], distance_squared)
 
 
 @ti.func

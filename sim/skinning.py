@@ -143,8 +143,8 @@ class Skin:
         frame, weight = carrier.interpolation.attach(self.at)
         self.carrier = carrier
         self.count = len(points)
-        given = points, points, frame, weight
-        self.vertices, self.rest, self.frame, self.weight = fields_of(*given, within=1)
+        arrays = points, points, frame, weight
+        self.vertices, self.rest, self.frame, self.weight = fields_of(*arrays, within=1)
         self.update()
 
     def attach_again(self) -> None:

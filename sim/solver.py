@@ -45,7 +45,7 @@ class SolverState:
     """All that steps change: the body, and what contacts and tissue carry from step to step, by name."""
 
     body: BodyState
-    history: dict[str, np.ndarray]
+    internal_state: dict[str, np.ndarray]
 
 
 class Solver:
@@ -70,8 +70,8 @@ class Solver:
         self.has_tool = tool is not None
         self.has_contacts = model.contacts is not None
         self.has_self_contacts = self_contacts is not None
-        self.history: dict[str, fields.Field] = getattr(model, "history", {})
-        self.has_history = bool(self.history)
+        self.internal_state: dict[str, fields.Field] = getattr(model, "internal_state", {})
+        self.has_internal_state = bool(self.internal_state)
 
     def step(self, settings: StepSettings, tool_poses: np.ndarray | None = None) -> None:
         """Advance by one time step.
@@ -102,15 +102,15 @@ class Solver:
     def snapshot(self) -> SolverState:
         """A copy of the current state."""
         contacts = self.contacts.snapshot() if self.contacts else {}
-        tissue = {name: array_of(field) for name, field in self.history.items()}
+        tissue = {name: array_of(field) for name, field in self.internal_state.items()}
         return SolverState(self.body.snapshot(), contacts | tissue)
 
     def restart(self) -> None:
-        """The stress-free shape, without velocities, contacts and history."""
+        """The stress-free shape, without velocities, contacts and internal variables."""
         self.body.restore(self.body.rest_state())
         if self.contacts:
             self.contacts.reset()
-        for field in self.history.values():
+        for field in self.internal_state.values():
             fill_evenly(field, 0.0)
         self.model.update_frames()
 
@@ -118,9 +118,10 @@ class Solver:
         """Restore a state; the steps that follow give the same bits as they did from it before."""
         self.body.restore(state.body)
         if self.contacts:
-            contacts = {name: each for name, each in state.history.items() if name not in self.history}
+            carried = state.internal_state.items()
+            contacts = {name: values for name, values in carried if name not in self.internal_state}
             self.contacts.restore(contacts)
-        fill(*((field, state.history[name]) for name, field in self.history.items()))
+        fill(*((field, state.internal_state[name]) for name, field in self.internal_state.items()))
         self.model.update_frames()
 
     @kernel
@@ -210,7 +211,7 @@ class Solver:
     def finish(self, dt: float):
         """Lines 23-26: velocities and positions from the predicted positions."""
         self.model.scatter()
-        if ti.static(self.has_history):
+        if ti.static(self.has_internal_state):
             self.model.finish(dt)  # type: ignore[attr-defined]
         if ti.static(self.has_contacts):
             self.contacts.finish()

@@ -43,12 +43,12 @@ def stored(compute: Callable[..., Arrays], *arguments: object, backend: str = ""
         return _in_order(compute(*arguments))
     file = FOLDER / f"{_key(compute, arguments, backend)}.npz"
     with suppress(*DAMAGED):
-        found = _read(file)
+        cached = _read(file)
         os.utime(file)
-        return found
+        return cached
     arrays = _in_order(compute(*arguments))
     # Larger ones would displace all others.
-    if sum(each.nbytes for each in arrays) < MOST_BYTES // 2:
+    if sum(array.nbytes for array in arrays) < MOST_BYTES // 2:
         with suppress(OSError):
             _write(file, arrays)
     return arrays
@@ -86,8 +86,8 @@ def _sources(folders: tuple[Path, ...]) -> bytes:
 
 
 def _read(file: Path) -> Arrays:
-    with np.load(file, allow_pickle=False) as found:
-        return tuple(found[f"arr_{n}"] for n in range(len(found.files)))
+    with np.load(file, allow_pickle=False) as archive:
+        return tuple(archive[f"arr_{n}"] for n in range(len(archive.files)))
 
 
 def _write(file: Path, arrays: Arrays) -> None:
@@ -110,7 +110,7 @@ def _remove_oldest(folder: Path) -> None:
     """
     kept = 0
     for status, file in sorted(
-        ((file.stat(), file) for file in folder.iterdir()), key=lambda each: -each[0].st_mtime
+        ((file.stat(), file) for file in folder.iterdir()), key=lambda entry: -entry[0].st_mtime
     ):
         kept += status.st_size
         if kept > MOST_BYTES:

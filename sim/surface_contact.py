@@ -39,9 +39,9 @@ class SurfaceContacts:
     shapes.
 
     point (p,): current positions [mm]. plane (shapes, p): normal and offset of n . x >= offset [mm]. slip
-    (shapes, p): elastic tangential slip [mm]. near (p,): bits of the shapes that are near. found (shapes, p):
-    point and distance [mm] of the last distance query. ``stiffness`` [kPa/mm]: penalty stiffness;
-    ``coefficient``: Coulomb's, where there was friction from the start.
+    (shapes, p): elastic tangential slip [mm]. near (p,): bits of the shapes that are near. last_query
+    (shapes, p): point and distance [mm] of the last distance query. ``stiffness`` [kPa/mm]: penalty
+    stiffness; ``coefficient``: Coulomb's, where there was friction from the start.
     """
 
     def __init__(
@@ -67,11 +67,11 @@ class SurfaceContacts:
         self.node, self.weight = fields_of(nodes, weights, within=1)
         self.area, self.node_start, self.node_point, self.node_weight = fields_of(area_mm2, *by_node)
         self.plane = zeros(len(shapes), self.count, 4, within=1)
-        self.found = zeros(len(shapes), self.count, 4, within=1)
-        self.state = dict(point=self.point, near=self.near, plane=self.plane, found=self.found)
+        self.last_query = zeros(len(shapes), self.count, 4, within=1)
+        # ``found`` and ``stick`` are the names in session files.
+        self.state = dict(point=self.point, near=self.near, plane=self.plane, found=self.last_query)
         if self.has_friction:
             self.slip = zeros(len(shapes), self.count, 3, within=1)
-            # The name in session files.
             self.state["stick"] = self.slip
         self.stiffness = 0.0
         self.penetration = zeros()
@@ -107,7 +107,7 @@ class SurfaceContacts:
 
     def reset(self) -> None:
         """Clear stored distances and friction; call it after other code has moved the body."""
-        fill_evenly(self.found, -FAR)
+        fill_evenly(self.last_query, -FAR)
         fill_evenly(self.near, 0)
         if self.has_friction:
             fill_evenly(self.slip, 0.0)
@@ -136,13 +136,13 @@ class SurfaceContacts:
             self.point[q], self.start[q] = p, start
             near = 0
             for s in ti.static(range(len(self.shapes))):
-                found = self.found[s, q]
-                if ti.static(self.shapes[s].moves) or not is_known(found, p):
+                query = self.last_query[s, q]
+                if ti.static(self.shapes[s].moves) or not is_known(query, p):
                     surface = self.shapes[s].surface(p)
-                    found = tm.vec4(p, ti.min(surface.w, REACH_MM))
-                    self.found[s, q] = found
+                    query = tm.vec4(p, ti.min(surface.w, REACH_MM))
+                    self.last_query[s, q] = query
                     self.plane[s, q] = tm.vec4(surface.xyz, surface.xyz.dot(p) - surface.w)
-                if found.w - (p - found.xyz).norm() < NEAR_MM:
+                if query.w - (p - query.xyz).norm() < NEAR_MM:
                     near |= 1 << s
             self.near[q] = near
 
@@ -294,7 +294,7 @@ class SurfaceContacts:
 
 
 @ti.func
-def is_known(found, p):
+def is_known(query, p):
     """Whether the last distance query of a point, its place and distance [mm], is still valid at p."""
-    moved = (p - found.xyz).norm()
-    return found.w - moved > NEAR_MM or (moved < REUSE_MM and found.w > -FAR)
+    moved = (p - query.xyz).norm()
+    return query.w - moved > NEAR_MM or (moved < REUSE_MM and query.w > -FAR)

@@ -286,8 +286,10 @@ def kernel_of(method: Callable) -> Kernel:
 def parameters_of(kernel: Kernel) -> list[Parameter]:
     """The parameters of a kernel. Raises TypeError for one that can be no argument."""
     return [
-        Parameter(each.name, None if at in kernel.template_slot_locations else _kind_of(each.annotation))
-        for at, each in enumerate(kernel.arguments)
+        Parameter(
+            argument.name, None if at in kernel.template_slot_locations else _kind_of(argument.annotation)
+        )
+        for at, argument in enumerate(kernel.arguments)
     ]
 
 
@@ -299,8 +301,8 @@ def compiled(kernel: Kernel, number: int, values: list) -> CompiledKernel:
     features = [
         None
         if at in kernel.template_slot_locations
-        else kernel.mapper.extract_arg(value, each.annotation, each.name)
-        for at, (value, each) in enumerate(zip(values, kernel.arguments, strict=True))
+        else kernel.mapper.extract_arg(value, argument.annotation, argument.name)
+        for at, (value, argument) in enumerate(zip(values, kernel.arguments, strict=True))
     ]
     key = kernel.func, number, AutodiffMode.NONE
     kernel.materialize(key=key, args=values, arg_features=features)

@@ -46,8 +46,8 @@ class TissueModel(Protocol):
     coarse tetrahedra that carry the image plane, over the resolution of the tissue. ``begin`` to ``project``
     are ti.funcs that the solver's kernels inline, so their outermost loops are parallel. A model whose
     material can be changed between steps also has ``set_material(young_kpa)``. One that carries more than the
-    body from step to step has ``history``, these fields by name, which its ti.func ``finish(dt)`` updates at
-    the end of each substep.
+    body from step to step has ``internal_state``, these fields by name, which its ti.func ``finish(dt)``
+    updates at the end of each substep.
     """
 
     EMBEDDING_CELL_RATIO: ClassVar[float]

@@ -27,10 +27,10 @@ class PronyTerm:
 
 
 class Relaxation:
-    """Stress history of ``count`` elements, of stresses relative to each element's stiffness.
+    """Internal variables of ``count`` elements: stresses relative to each element's stiffness.
 
     elastic (m,): S_e at the end of the last substep; overstress (m, terms): the integrals. In a substep the
-    stress is ``factor`` S_e + ``history`` (m,).
+    stress is ``factor`` S_e + ``past_stress`` (m,).
     """
 
     def __init__(self, terms: Sequence[PronyTerm], count: int) -> None:
@@ -42,14 +42,14 @@ class Relaxation:
         )
         self.elastic = zeros(count, COMPONENTS, within=1)
         self.overstress = zeros(count, self.terms, COMPONENTS, within=1)
-        self.history = zeros(count + 1, COMPONENTS, within=1)
+        self.past_stress = zeros(count + 1, COMPONENTS, within=1)
         self.factor = zeros()
         self.state = dict(elastic_stress=self.elastic, overstress=self.overstress)
         self.reset()
 
     def reset(self) -> None:
-        """The history of tissue that never was deformed."""
-        for field in (*self.state.values(), self.history):
+        """The internal variables of tissue that never was deformed."""
+        for field in (*self.state.values(), self.past_stress):
             fill_evenly(field, 0.0)
 
     def complete(self) -> None:
@@ -67,10 +67,10 @@ class Relaxation:
                 factor += self.ratio[t] * mean_decay(dt / self.time_s[t])
             self.factor[None] = factor
         for c in range(self.count):
-            history = -(self.factor[None] - 1.0) * self.elastic[c]
+            stress = -(self.factor[None] - 1.0) * self.elastic[c]
             for t in range(self.terms):
-                history += ti.exp(-dt / self.time_s[t]) * self.overstress[c, t]
-            self.history[c] = history
+                stress += ti.exp(-dt / self.time_s[t]) * self.overstress[c, t]
+            self.past_stress[c] = stress
 
     @ti.func
     def finish(self, c, elastic, dt: float):

@@ -52,7 +52,7 @@ class FakeOrgan:
     def restore(self, state: OrganState) -> None:
         body = state.solver.body
         self.position, self.velocity = body.position.copy(), body.velocity.copy()
-        self.friction = state.solver.history["friction"].copy()
+        self.friction = state.solver.internal_state["friction"].copy()
         self.divergence, self.pose, self.steps = state.divergence, state.pose, state.steps
 
     def timed_step(self, pose, length_s, iterations) -> tuple[float, np.ndarray]:

@@ -51,7 +51,7 @@ class TissueError(UserError):
 
 @cache
 def tissue_table() -> dict[str, dict]:
-    """Return the values by tissue, as in the file, and "hounsfield"."""
+    """The values by tissue, as in the file, and "hounsfield"."""
     return tomllib.loads(TISSUES.read_text("utf-8"))
 
 
@@ -73,7 +73,7 @@ class TissueVoxels:
 
 
 def acoustic_values(tissue: str) -> tuple[float, float, float, float]:
-    """Return the mean of a tissue's values, as those of a voxel in ``properties``."""
+    """The mean of a tissue's values, as those of a voxel in ``properties``."""
     impedance, attenuation, level_db, anisotropy = acoustic_table(tissue)
     return impedance, attenuation, 10 ** ((level_db + CORTEX_DB) / 20), anisotropy
 
@@ -90,8 +90,9 @@ def check_tissues(tissue_of_label: Mapping[int, str]) -> None:
 
 
 def impedance_of_hu(hu: np.ndarray) -> np.ndarray:
-    """Return acoustic impedance [MRayl] of HU: density by Schneider's piecewise fit (k-Wave's
-    ``hounsfield2density``), speed of sound from density by Mast 2000, for soft tissue."""
+    """Acoustic impedance [MRayl] of HU: density by Schneider's piecewise fit (k-Wave's
+    ``hounsfield2density``), speed of sound from density by Mast 2000, for soft tissue.
+    """
     h = np.asarray(hu, np.float32) + np.float32(1000)
     pieces = [h < 930, h < 1098, h < 1260]
     slope = np.select(pieces, [1.025793065, 0.9082709691, 0.5108369316], 0.6625370912).astype(np.float32)
@@ -101,9 +102,7 @@ def impedance_of_hu(hu: np.ndarray) -> np.ndarray:
 
 
 def impedance_of_tissue(hu: np.ndarray) -> np.ndarray:
-    """Return acoustic impedance [MRayl] of unlabelled tissue, perhaps with contrast agent: see
-    AGENT_FROM_HU.
-    """
+    """Acoustic impedance [MRayl] of unlabelled tissue, perhaps with contrast agent: see AGENT_FROM_HU."""
     without = np.interp(
         hu, [AGENT_FROM_HU, AGENT_TO_HU, CALCIFIED_HU], [AGENT_FROM_HU, AGENT_FROM_HU, CALCIFIED_HU]
     )
@@ -129,8 +128,8 @@ def properties(
     tissue_of_label: Mapping[int, str] | None = None,
     spacing_mm: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return impedance [MRayl], attenuation [dB/cm/MHz], backscattered amplitude (1: perfect reflector) and
-    its anisotropy [dB], (..., 4) float32.
+    """Impedance [MRayl], attenuation [dB/cm/MHz], backscattered amplitude (1: perfect reflector) and its
+    anisotropy [dB], (..., 4) float32.
 
     ``hu`` and ``labels`` have the same shape; 0 and labels without a tissue have values by HU. Raises
     TissueError.
@@ -165,7 +164,7 @@ def properties(
 
 
 def acoustic_table(tissue: str) -> tuple[float, float, float, float]:
-    """Return a tissue's values as in the table, backscatter in dB against cortex."""
+    """A tissue's values as in the table, backscatter in dB against cortex."""
     table = tissue_table()[tissue]
     if tissue == UNKNOWN:
         return 0.0, 0.0, 0.0, 0.0
@@ -178,7 +177,7 @@ def acoustic_table(tissue: str) -> tuple[float, float, float, float]:
 
 
 def _codes(labels: np.ndarray, tissues: Mapping[int, str]) -> tuple[np.ndarray, list[str]]:
-    """Return labels as indices of a list of tissues, of which the first is what has none."""
+    """Labels as indices of a list of tissues, of which the first is what has none."""
     present = set(np.unique(labels).tolist())
     names = [UNKNOWN, *dict.fromkeys(name for value, name in tissues.items() if value in present)]
     table = np.zeros(max(present) + 1, np.uint8)
@@ -188,7 +187,7 @@ def _codes(labels: np.ndarray, tissues: Mapping[int, str]) -> tuple[np.ndarray, 
 
 
 def _texture(codes: np.ndarray, names: list[str], spacing_mm: np.ndarray) -> np.ndarray:
-    """Return how the backscatter level of each tissue varies by chance [dB]."""
+    """How the backscatter level of each tissue varies by chance [dB]."""
     distance = np.array([tissue_table()[name]["texture_mm"] for name in names])
     size = np.array([tissue_table()[name]["texture_db"] for name in names], np.float32)
     texture = np.zeros(codes.shape, np.float32)
@@ -199,8 +198,8 @@ def _texture(codes: np.ndarray, names: list[str], spacing_mm: np.ndarray) -> np.
 
 
 def _variation(hu: np.ndarray, codes: np.ndarray, names: list[str], spacing_mm: np.ndarray) -> np.ndarray:
-    """Return how the backscatter level varies with HU within a tissue [dB] (Wein et al. 2008, Med Image Anal
-    12, 577: echogenicity from HU).
+    """How the backscatter level varies with HU within a tissue [dB] (Wein et al. 2008, Med Image Anal 12,
+    577: echogenicity from HU).
 
     HU are relative to the tissue's own median, so that its borders are none here, and noise can be averaged
     across them.
@@ -228,7 +227,7 @@ def _add_hard(values: np.ndarray, tissue: str, where: np.ndarray) -> None:
 
 
 def _by_hounsfield(hu: np.ndarray) -> np.ndarray:
-    """Return values (..., 4) of HU, backscatter in dB, from a table of integer HU."""
+    """Values (..., 4) of HU, backscatter in dB, from a table of integer HU."""
     table = tissue_table()["hounsfield"]
     every = np.arange(MIN_HU, MAX_HU + 1)
     attenuation = np.interp(every, table["hu"], table["attenuation_db_cm_mhz"])
@@ -240,16 +239,14 @@ def _by_hounsfield(hu: np.ndarray) -> np.ndarray:
 
 
 def noise_of(shape: tuple[int, ...], sd_voxels: np.ndarray) -> np.ndarray:
-    """Return noise of unit SD, smoothed by an SD along each axis, the same for the same voxels on every
-    machine.
-    """
+    """Noise of unit SD, smoothed by an SD along each axis, the same for the same voxels on every machine."""
     noise = np.random.default_rng(SEED).standard_normal(shape, dtype=np.float32)
     noise = ndimage.gaussian_filter(noise, sd_voxels, truncate=2, mode="wrap")
     return noise / max(float(noise.std()), 1e-6)
 
 
 def _arcuate(cortex: np.ndarray, medulla: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return the places between cortex and medulla where arcuate vessels are."""
+    """The places between cortex and medulla where arcuate vessels are."""
     border = _border(medulla, cortex, ARCUATE_MM, spacing_mm)
     if not border.any():
         return border
@@ -260,7 +257,7 @@ def _arcuate(cortex: np.ndarray, medulla: np.ndarray, spacing_mm: np.ndarray) ->
 def _border(
     inside: np.ndarray, outside: np.ndarray, thickness_mm: float, spacing_mm: np.ndarray
 ) -> np.ndarray:
-    """Return the part of a mask within a thickness of another, at least one voxel thick."""
+    """The part of a mask within a thickness of another, at least one voxel thick."""
     if not (inside.any() and outside.any()):
         return np.zeros_like(inside)
     distance = ndimage.distance_transform_edt(~outside, sampling=spacing_mm)

@@ -95,7 +95,7 @@ class AnatomyVolumes:
 
 
 def flow_volume(voxels: TissueVoxels) -> SampledVolume:
-    """Return the blood flow, of ``blood_flow.CHANNELS``, along the axes in mm; zero without vessels."""
+    """The blood flow, of ``blood_flow.CHANNELS``, along the axes in mm; zero without vessels."""
     low, values = stored_flow(voxels)
     values = values.astype(np.float32)
     axes = np.linalg.inv(voxels.index_from_mm[:3, :3]) / voxels.spacing_mm

@@ -107,7 +107,7 @@ class ApertureRays:
         squared.
         """
         for line, k in ti.ndrange(self.lines, count):
-            total, path, found = 0.0, 0.0, 0.0
+            total, path, ray_count = 0.0, 0.0, 0.0
             for ray in ti.static(range(RAYS)):
                 origin = line - self.offset[ray, k]
                 if origin >= 0 and origin < self.lines:
@@ -116,14 +116,14 @@ class ApertureRays:
                     one_way *= self.focusing(ray, line, k)
                     total += one_way
                     path += one_way * along
-                    found += 1.0
-            round_trip[line, k] = build_up[k] * (total / found) ** 2
+                    ray_count += 1.0
+            round_trip[line, k] = build_up[k] * (total / ray_count) ** 2
             round_trip_path[line, k] = 2.0 * path / ti.max(total, 1e-30)
 
     @ti.func
     def focusing(self, ray, line, k):
-        """Return the factor of amplitude of rays that refraction has moved together or apart, over a
-        Fresnel zone.
+        """The factor of amplitude of rays that refraction has moved together or apart, over a Fresnel
+        zone.
         """
         zone = self.zone[k]
         low, high = ti.max(line - zone, 0), ti.min(line + zone, self.lines - 1)
@@ -133,15 +133,15 @@ class ApertureRays:
 
     @ti.func
     def attenuated(self, path):
-        """Return the amplitude of speckle that attenuation on a path one way [Np/MHz] leaves, one way."""
+        """The amplitude of speckle that attenuation on a path one way [Np/MHz] leaves, one way."""
         at = ti.min(path * (2.0 * FINER / PATH_STEP), FINER * PATH_ENTRIES - 1.001)
         first = ti.cast(at, ti.i32)
         return tm.mix(self.one_way[first], self.one_way[first + 1], at - first)
 
 
 def fresnel_zones(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
-    """Return half of the Fresnel zone halfway to each depth, at least one scanline, (depths,) int32: less
-    does not bend a wave.
+    """Half of the Fresnel zone halfway to each depth, at least one scanline, (depths,) int32: less does not
+    bend a wave.
     """
     zone_mm = np.sqrt(probe.wavelength_mm * depth_mm) / 2
     return np.maximum(np.rint(zone_mm / np.maximum(probe.line_spacing_mm(depth_mm), 1e-3)), 1).astype(
@@ -150,7 +150,7 @@ def fresnel_zones(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
 
 
 def ray_offsets(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
-    """Return how many scanlines beside its end at a depth each ray leaves the face (RAYS, depths) int32.
+    """How many scanlines beside its end at a depth each ray leaves the face (RAYS, depths) int32.
 
     Each ray stands for an equal part of the aperture.
     """

@@ -26,12 +26,10 @@ class ArrayContact:
 
 
 def face_points(size_mm: np.ndarray, radius_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (n, 3) evenly over the face, in the transducer's axes [mm], and the area (n,) of each
-    [mm^2].
-    """
+    """Points (n, 3) evenly over the face, in the transducer's axes [mm], and the area (n,) of each [mm^2]."""
     counts = np.maximum(np.rint(np.asarray(size_mm[:2]) / SPACING_MM).astype(int), 1)
     x, y = ((np.arange(n) + 0.5) / n * s - s / 2 for n, s in zip(counts, size_mm[:2], strict=True))
-    x, y = (each.ravel() for each in np.meshgrid(x, y))
+    x, y = (grid.ravel() for grid in np.meshgrid(x, y))
     points = np.column_stack([x, y, sagitta(x, radius_mm) - size_mm[2] / 2])
     slope = np.ones_like(x) if radius_mm == 0 else radius_mm / np.sqrt(np.maximum(radius_mm**2 - x**2, 1e-6))
     return points, slope * np.prod(np.asarray(size_mm[:2]) / counts)
@@ -45,8 +43,8 @@ def measure_contact(
     rest_mm: np.ndarray,
     faces: np.ndarray,
 ) -> ArrayContact:
-    """Return the contact of a transducer at a pose (4, 4) with a closed surface, vertices (v, 3) deformed
-    and at rest [mm].
+    """The contact of a transducer at a pose (4, 4) with a closed surface, vertices (v, 3) deformed and at
+    rest [mm].
     """
     points, area = face_points(size_mm, radius_mm)
     local = (now_mm - pose[:3, 3]) @ pose[:3, :3]
@@ -81,8 +79,8 @@ def measure_contact(
 
 
 def _weights(corners: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return barycentric weights (t, k, 3) of points (k, 2) in triangles (t, 3, 3) projected along z, and
-    whether inside.
+    """Barycentric weights (t, k, 3) of points (k, 2) in triangles (t, 3, 3) projected along z, and whether
+    inside.
     """
     a, b, c = (corners[:, i, :2] for i in range(3))
     twice = _cross(b - a, c - a)

@@ -19,7 +19,7 @@ MIN_APERTURE = 0.5
 
 
 def summed_frequencies(probe: Probe) -> tuple[np.ndarray, np.ndarray]:
-    """Return a few frequencies [MHz] that stand for the pulse, and their shares of its energy."""
+    """A few frequencies [MHz] that stand for the pulse, and their shares of its energy."""
     frequency, amplitude = pulse_spectrum(probe.frequency_mhz, probe.bandwidth_percent)
     below = np.cumsum(amplitude**2) / (amplitude**2).sum()
     nodes, weights = np.polynomial.legendre.leggauss(SUMMED_FREQUENCIES)
@@ -27,13 +27,13 @@ def summed_frequencies(probe: Probe) -> tuple[np.ndarray, np.ndarray]:
 
 
 def profile_depths(probe: Probe) -> np.ndarray:
-    """Return depths [mm] at which profiles are computed, denser near the face."""
+    """Depths [mm] at which profiles are computed, denser near the face."""
     return probe.depth_mm * np.linspace(0.08, 1.0, PROFILE_DEPTHS) ** 1.5
 
 
 def half_apertures_mm(probe: Probe, depth_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return half widths of the transmit and of the receive aperture at depths [mm], before the array's
-    ends limit them.
+    """Half widths of the transmit and of the receive aperture at depths [mm], before the array's ends limit
+    them.
     """
     least = MIN_APERTURE * probe.wavelength_mm
     if probe.transducer_geometry == "PHASED":
@@ -44,8 +44,7 @@ def half_apertures_mm(probe: Probe, depth_mm: np.ndarray) -> tuple[np.ndarray, n
 
 
 def lateral_profiles(probe: Probe, scanline: float, depth_mm: np.ndarray, lag: np.ndarray) -> np.ndarray:
-    """Return how a scanline sees scatterers on its neighbours: amplitude (depths, lags), 1 on the scanline
-    itself.
+    """How a scanline sees scatterers on its neighbours: amplitude (depths, lags), 1 on the scanline itself.
 
     ``scanline`` is its index; ``lag`` are distances in scanlines, at the same depth.
     """
@@ -62,15 +61,15 @@ def lateral_profiles(probe: Probe, scanline: float, depth_mm: np.ndarray, lag: n
             # Sound of twice the frequency arises as the square of the transmitted field.
             elements = _aperture(probe, scanline, half_apertures_mm(probe, depth_mm)[0])
             sent = [_field(*elements, axis, place, frequency / 2, probe.pitch_mm) for place in (to, at)]
-            fields[0] = [each**2 for each in sent]
+            fields[0] = [field**2 for field in sent]
         energy += share * np.abs(fields[0][0] * fields[1][0]) ** 2
         on_axis += share * np.abs(fields[0][1] * fields[1][1])[:, 0] ** 2
     return np.sqrt(energy / on_axis[:, None])
 
 
 def elevation_profiles(probe: Probe, depth_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the slice thickness and the correlation of speckle across the image plane at depths, each as an
-    SD [mm].
+    """The slice thickness and the correlation of speckle across the image plane at depths, each as an SD
+    [mm].
 
     The thickness is that of the two-way beam (full width at half maximum). Speckle at a distance d from the
     plane correlates as exp(-d^2 / (2 SD^2)) in intensity; in a beam out of focus it is finer than the beam is
@@ -103,7 +102,7 @@ def _nodes() -> np.ndarray:
 
 
 def _on_scanlines(probe: Probe, index: float | np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
-    """Return points (depths, indices, 2) [mm] of the image plane on scanlines, of which the indices are
+    """Points (depths, indices, 2) [mm] of the image plane on scanlines, of which the indices are
     fractional.
     """
     share, steering = (np.atleast_1d(index) + 0.5) / probe.number_of_scanlines, np.radians(probe.steering_deg)
@@ -118,8 +117,7 @@ def _on_scanlines(probe: Probe, index: float | np.ndarray, depth_mm: np.ndarray)
 
 
 def _aperture(probe: Probe, scanline: float, half_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return points of an aperture around a scanline [mm] and their normals, both (depths, APERTURE_POINTS,
-    2).
+    """Points of an aperture around a scanline [mm] and their normals, both (depths, APERTURE_POINTS, 2).
 
     It is cut off at the array's ends.
     """
@@ -147,7 +145,7 @@ def _field(
     frequency_mhz: float,
     pitch_mm: float = 0.0,
 ) -> np.ndarray:
-    """Return the field (depths, places) of an aperture (depths, APERTURE_POINTS, 2) focused at (.., 1, 2), at
+    """The field (depths, places) of an aperture (depths, APERTURE_POINTS, 2) focused at (.., 1, 2), at
     (depths, places, 2).
 
     Elements as wide as the pitch, in a soft baffle, radiate less to the side (Selfridge 1980).
@@ -168,8 +166,8 @@ def _field(
 
 
 def _first_below(values: np.ndarray, limit: float) -> float:
-    """Return the fractional index at which falling values first are below a limit; the last one if they
-    never are.
+    """The fractional index at which falling values first are below a limit; the last one if they never
+    are.
     """
     below = int(np.argmax(values < limit))
     if below == 0:
@@ -178,7 +176,7 @@ def _first_below(values: np.ndarray, limit: float) -> float:
 
 
 def _width(offset: np.ndarray, amplitude: np.ndarray) -> float:
-    """Return the full width at half maximum around the middle."""
+    """The full width at half maximum around the middle."""
     middle, step = len(offset) // 2, offset[1] - offset[0]
     half = 0.5 * amplitude[middle]
     return float(step * (_first_below(amplitude[middle:], half) + _first_below(amplitude[middle::-1], half)))

@@ -44,13 +44,13 @@ BEAT_S, SYSTOLE_S, FALL_S = 60 / 70, 0.09, 0.22
 
 @cache
 def flow_table() -> dict[str, dict]:
-    """Return the values by kind of vessel, as in the file."""
+    """The values by kind of vessel, as in the file."""
     return tomllib.loads(TABLE.read_text("utf-8"))
 
 
 def pulse_share(time_s: float) -> float:
-    """Return how much of its pulsatile part the velocity has at a time: 0 at the end of diastole, 1 at the
-    peak of systole.
+    """How much of its pulsatile part the velocity has at a time: 0 at the end of diastole, 1 at the peak of
+    systole.
     """
     phase = time_s % BEAT_S
     if phase < SYSTOLE_S:
@@ -79,8 +79,8 @@ def _flow_of_texts(
 def blood_flow(
     labels: np.ndarray, tissue_of_label: Mapping[int, str], spacing_mm: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index (3,) of the first voxel of a box that contains all flow, and the flow in it (nx, ny,
-    nz, CHANNELS) float32.
+    """The index (3,) of the first voxel of a box that contains all flow, and the flow in it (nx, ny, nz,
+    CHANNELS) float32.
 
     The kind of a vessel is its label's, or that of a labelled one nearby. The box has at least one voxel.
     """
@@ -108,9 +108,9 @@ def blood_flow(
 
 
 def _box(mask: np.ndarray) -> tuple[slice, ...]:
-    """Return the box around a mask, one voxel wider; one voxel of an empty one."""
-    found = ndimage.find_objects(mask.astype(np.uint8))
-    box = found[0] if found else (slice(0, 1),) * 3
+    """The box around a mask, one voxel wider; one voxel of an empty one."""
+    boxes = ndimage.find_objects(mask.astype(np.uint8))
+    box = boxes[0] if boxes else (slice(0, 1),) * 3
     return tuple(slice(max(a.start - 1, 0), min(a.stop + 1, n)) for a, n in zip(box, mask.shape, strict=True))
 
 
@@ -157,7 +157,7 @@ def _add_vessels(
 
 
 def _distance_from(kidney: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return the distance [mm] from the kidney; without one, from the middle."""
+    """The distance [mm] from the kidney; without one, from the middle."""
     if kidney.any():
         return ndimage.distance_transform_edt(~kidney, sampling=spacing_mm)
     middle = (np.array(kidney.shape) - 1) / 2
@@ -165,14 +165,14 @@ def _distance_from(kidney: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
 
 
 def _distance_to_border(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return the distance [mm] of the voxels of a mask to the nearest outside it, float32."""
+    """The distance [mm] of the voxels of a mask to the nearest outside it, float32."""
     distance = ndimage.distance_transform_edt(np.pad(mask, 1), sampling=spacing_mm)
     return distance[1:-1, 1:-1, 1:-1].astype(np.float32)
 
 
 def _potential(where: np.ndarray, away: np.ndarray, spacing_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mask of the connected vessels, and a potential in them whose gradient leads from each one's
-    end far from the kidney.
+    """The mask of the connected vessels, and a potential in them whose gradient leads from each one's end far
+    from the kidney.
 
     It is that of a flow which enters at that end, runs along the walls and is lost evenly on its way: its
     divergence is -1. ``away`` is the distance from the kidney.
@@ -195,7 +195,7 @@ def _potential(where: np.ndarray, away: np.ndarray, spacing_mm: np.ndarray) -> t
 
 
 def _laplacian(body: np.ndarray, spacing_mm: np.ndarray) -> sparse.csr_array:
-    """Return minus the Laplacian of the voxels of a mask, through whose border nothing flows [1/mm2]."""
+    """Minus the Laplacian of the voxels of a mask, through whose border nothing flows [1/mm2]."""
     index = np.full(body.shape, -1)
     index[body] = np.arange(body.sum())
     joined = []
@@ -203,7 +203,7 @@ def _laplacian(body: np.ndarray, spacing_mm: np.ndarray) -> sparse.csr_array:
         one, next_one = np.moveaxis(index, axis, 0)[:-1], np.moveaxis(index, axis, 0)[1:]
         both = (one >= 0) & (next_one >= 0)
         joined.append((one[both], next_one[both], np.full(both.sum(), spacing**-2.0)))
-    first, second, weight = (np.concatenate(each) for each in zip(*joined, strict=True))
+    first, second, weight = (np.concatenate(arrays) for arrays in zip(*joined, strict=True))
     size = int(body.sum())
     pairs = sparse.coo_array((weight, (first, second)), (size, size)).tocsr()
     pairs = pairs + pairs.T
@@ -211,7 +211,7 @@ def _laplacian(body: np.ndarray, spacing_mm: np.ndarray) -> sparse.csr_array:
 
 
 def _direction(potential: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return the unit direction (nx, ny, nz, 3) in which a potential rises; 0 where it does not."""
+    """The unit direction (nx, ny, nz, 3) in which a potential rises; 0 where it does not."""
     gradient = [
         np.gradient(potential, spacing, axis=axis) if potential.shape[axis] > 1 else np.zeros(potential.shape)
         for axis, spacing in enumerate(spacing_mm)

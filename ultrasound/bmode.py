@@ -59,15 +59,15 @@ class Wavefront:
 
     @classmethod
     def of(cls, probe: Probe, world_from_plane: np.ndarray) -> "Wavefront":
-        """Return that of a probe at a pose (4, 4), of tissue that has not moved."""
+        """That of a probe at a pose (4, 4), of tissue that has not moved."""
         steering = np.radians(probe.steering_deg)
         apex = world_from_plane @ [0.0, -probe.radius_mm, 0.0, 1.0]
         direction = world_from_plane[:3, :2] @ [np.sin(steering), np.cos(steering)]
         return cls(apex[:3], direction, probe.radius_mm, probe.sector is None)
 
     def angle_deg(self, probe: Probe, world_from_plane: np.ndarray) -> float:
-        """Return the largest angle between it and the scanlines of a pose, halfway down: a phase that turns
-        along them would be another frequency.
+        """The largest angle between it and the scanlines of a pose, halfway down: a phase that turns along
+        them would be another frequency.
         """
         start, direction = probe.scanlines()
         place = (start + probe.depth_mm / 2 * direction) @ world_from_plane[:3, :2].T + world_from_plane[
@@ -121,8 +121,8 @@ class BMode:
         self.covered = np.zeros(self.plane.shape, bool)
 
     def render(self, probe: Probe, detail_level: DetailLevel = "speckle") -> np.ndarray:
-        """Return grey values (rows, columns) uint8 of the plane located last, for a probe with the same
-        numbers of scanlines and samples.
+        """Grey values (rows, columns) uint8 of the plane located last, for a probe with the same numbers of
+        scanlines and samples.
 
         ``decibel`` then holds its scanlines, ``real`` and ``imaginary`` their echo.
         """
@@ -148,26 +148,24 @@ class BMode:
         return self.scan_converted(probe)
 
     def scan_converted(self, probe: Probe) -> np.ndarray:
-        """Return grey values (rows, columns) uint8 of ``decibel``, for the settings of the probe rendered
-        last.
-        """
+        """Grey values (rows, columns) uint8 of ``decibel``, for the settings of the probe rendered last."""
         image = np.empty(self.plane.shape, np.uint8)
         self._scan_convert(probe.dyn_range_db, image)
         return image
 
     def iq_of_last(self, probe: Probe, wavefront: Wavefront) -> tuple[np.ndarray, np.ndarray]:
-        """Return the IQ signal (scanlines, samples) complex64 of the image rendered last, and rest positions
-        (.., 3) [mm] of its samples.
+        """The IQ signal (scanlines, samples) complex64 of the image rendered last, and rest positions (.., 3)
+        [mm] of its samples.
 
         Its phase is that of the carrier: it turns with the distance of the tissue from the array, so that
         motion can be measured. ``real``, ``imaginary`` and ``decibel`` stay as they are.
         """
         signal = self.real, self.imaginary, self.decibel
-        before = [array_of(each) for each in signal]
+        before = [array_of(field) for field in signal]
         stride = self.sound.stride_of(probe)
         rest = np.empty((self.lines, self.samples, 3), np.float32)
         turn = 4 * np.pi / probe.wavelength_mm
-        apex, direction = (tm.vec3(*map(float, each)) for each in (wavefront.apex, wavefront.direction))
+        apex, direction = (tm.vec3(*map(float, vector)) for vector in (wavefront.apex, wavefront.direction))
         self._turn(
             stride, probe.sample_mm, turn, wavefront.is_flat, apex, direction, wavefront.radius_mm, rest
         )
@@ -227,7 +225,7 @@ class BMode:
         depth = self.sound.stride_of(probe) * probe.sample_mm * np.arange(self.sound.most)
         nodes = profile_depths(probe)
         slice_sd, correlation_sd = (
-            np.interp(depth, nodes, each) for each in elevation_profiles(probe, nodes)
+            np.interp(depth, nodes, profile) for profile in elevation_profiles(probe, nodes)
         )
         self.sound.set_probe(probe, slice_sd)
         weights, half, speckle_gain = lateral_kernel(probe)
@@ -291,10 +289,10 @@ class BMode:
                 self.scattered_real[line, first + j] = 0.0
                 self.scattered_imaginary[line, first + j] = 0.0
             axis = self.speckle.long_axis(self.sound.across[line, k])
-            for each in range(COMPONENTS):
-                weight = self.speckle.weight(each, axis, self.elevation[k])
+            for component in range(COMPONENTS):
+                weight = self.speckle.weight(component, axis, self.elevation[k])
                 if weight > LEAST_WEIGHT:
-                    key, matrix = self.speckle.component(each, axis, self.elevation[k], speckle_sd, look)
+                    key, matrix = self.speckle.component(component, axis, self.elevation[k], speckle_sd, look)
                     near, far = matrix @ self.sound.rest[line, k], matrix @ self.sound.rest[line, k + 1]
                     for j in ti.static(range(stride)):
                         t = (j + 0.5) / stride
@@ -409,14 +407,14 @@ class BMode:
 
     @ti.func
     def speckle_at(self, line, at, speckle_sd, look):
-        """Return the speckle (2,) at a fractional tissue sample of a scanline."""
+        """The speckle (2,) at a fractional tissue sample of a scanline."""
         k = ti.cast(at, ti.i32)
         rest = tm.mix(self.sound.rest[line, k], self.sound.rest[line, k + 1], at - k)
         axis, speckle = self.speckle.long_axis(self.sound.across[line, k]), tm.vec2(0.0)
-        for each in range(COMPONENTS):
-            weight = self.speckle.weight(each, axis, self.elevation[k])
+        for component in range(COMPONENTS):
+            weight = self.speckle.weight(component, axis, self.elevation[k])
             if weight > LEAST_WEIGHT:
-                key, matrix = self.speckle.component(each, axis, self.elevation[k], speckle_sd, look)
+                key, matrix = self.speckle.component(component, axis, self.elevation[k], speckle_sd, look)
                 speckle += weight * self.speckle.at(matrix @ rest, key)
         return speckle
 
@@ -435,8 +433,8 @@ class BMode:
         for packet, line in ti.ndrange(self.samples // LANES, self.lines):
             first = packet * LANES
             real, imaginary = Packet(0.0), Packet(0.0)
-            each, side = self.scanline_class[line], self.side[line]
-            half = self.half[each, packet]
+            line_class, side = self.scanline_class[line], self.side[line]
+            half = self.half[line_class, packet]
             k = -half
             # LLVM would vectorize a for loop over scanlines instead of lanes, which takes four times as long.
             while k <= half:
@@ -445,7 +443,7 @@ class BMode:
                 m = ti.min(m, 2 * (self.lines - 1) - m)
                 # Conjugate, so that noise does not add coherently to itself; reflections are real.
                 turned = 1.0 if m == line + k else -1.0
-                weight = self.weight[each, packet, side * k + MAX_HALF_WIDTH]
+                weight = self.weight[line_class, packet, side * k + MAX_HALF_WIDTH]
                 real += weight * self.packet(self.real, m, first)
                 imaginary += turned * weight * self.packet(self.imaginary, m, first)
                 k += 1
@@ -462,8 +460,8 @@ class BMode:
 
     @ti.func
     def electronic_noise(self, line, packet, key):
-        """Return noise (2, LANES) of unit mean square, which changes with the key; as long as the pulse,
-        but on one scanline.
+        """Noise (2, LANES) of unit mean square, which changes with the key; as long as the pulse, but on one
+        scanline.
         """
         rows, packets = ti.static(SIZE * SIZE, SIZE // LANES)
         row = (line * 3 + (line // 21) * 320 + (packet // packets) * 448 + key) & (rows - 1)
@@ -477,7 +475,7 @@ class BMode:
 
     @ti.func
     def packet(self, field: ti.template(), row, first):
-        """Return LANES entries of a row of a field."""
+        """LANES entries of a row of a field."""
         return Packet([field[row, first + i] for i in ti.static(range(LANES))])
 
     @kernel
@@ -491,7 +489,7 @@ class BMode:
 
     @ti.func
     def grey_at(self, at, dynamic_range_db):
-        """Return the grey value at a fractional scanline and sample; 0 outside the image."""
+        """The grey value at a fractional scanline and sample; 0 outside the image."""
         grey = 0.0
         if at.x >= -0.5:
             x, y = tm.clamp(at.x, 0.0, self.lines - 1.001), tm.clamp(at.y, 0.0, self.samples - 1.001)
@@ -506,8 +504,8 @@ class BMode:
 
 
 def source_of_pixels(probe: Probe, rows: int, columns: int) -> np.ndarray:
-    """Return scanline and sample index, fractional, of each pixel's centre, (rows, columns, 2) float32; -1
-    outside the image.
+    """Scanline and sample index, fractional, of each pixel's centre, (rows, columns, 2) float32; -1 outside
+    the image.
     """
     width, depth, above = probe.extent_mm
     u = (np.arange(columns) + 0.5) / columns * width - width / 2
@@ -521,15 +519,15 @@ def source_of_pixels(probe: Probe, rows: int, columns: int) -> np.ndarray:
 
 
 def padded_source(probe: Probe, shape: tuple[int, int], most: tuple[int, ...]) -> np.ndarray:
-    """Return ``source_of_pixels`` of an image of a shape, filled up to the shape ``most``."""
+    """``source_of_pixels`` of an image of a shape, filled up to the shape ``most``."""
     source = np.zeros((*most, 2), np.float32)
     source[: shape[0], : shape[1]] = source_of_pixels(probe, *shape)
     return source
 
 
 def length_weights(pulse_sd: float) -> np.ndarray:
-    """Return kernels (LENGTHS, 2 LENGTH_TAPS + 1) that lengthen noise of a correlation SD, by SDs of
-    LENGTH_STEP each, in samples.
+    """Kernels (LENGTHS, 2 LENGTH_TAPS + 1) that lengthen noise of a correlation SD, by SDs of LENGTH_STEP
+    each, in samples.
 
     They preserve the mean square.
     """

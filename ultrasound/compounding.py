@@ -19,7 +19,7 @@ class Compounding:
         self.steered: dict[float, BMode] = {}
 
     def render(self, probe: Probe, detail_level: DetailLevel) -> np.ndarray:
-        """Return the mean (rows, columns) uint8 of all angles, where these reach, of the plane located."""
+        """The mean (rows, columns) uint8 of all angles, where these reach, of the plane located."""
         angles = probe.compound_angles_deg[1:]
         self.steered = {angle: self.steered.get(angle) or self._make_steered() for angle in angles}
         first = self.straight.render(probe, detail_level)

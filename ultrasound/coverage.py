@@ -56,7 +56,7 @@ class Coverage:
         self.seen = np.zeros(self.distance.shape, bool)
 
     def _around(self, tumour: trimesh.Trimesh, margin_mm: float) -> np.ndarray:
-        """Return signed distances [mm] from the tumour: of the voxels near it, infinity elsewhere."""
+        """Signed distances [mm] from the tumour: of the voxels near it, infinity elsewhere."""
         around = np.full(self.distance.shape, np.inf)
         low, high = self._indices(tumour.bounds + np.array([[-margin_mm], [margin_mm]]))
         low = np.maximum(np.floor(low).astype(int), 0)
@@ -105,26 +105,26 @@ class Coverage:
         return contact
 
     def fraction(self, target: str) -> float:
-        """Return the imaged fraction of a target, 0 to 1; NaN without that target."""
+        """The imaged fraction of a target, 0 to 1; NaN without that target."""
         mask = self.targets.get(target)
         return float(self.seen[mask].mean()) if mask is not None and mask.any() else float("nan")
 
     def voxel_centres(self, target: str) -> np.ndarray:
-        """Return the centres (n, 3) of a target's voxels [mm]."""
+        """The centres (n, 3) of a target's voxels [mm]."""
         return self.origin_mm + VOXEL_MM * np.argwhere(self.targets[target])
 
     def gaps(self, target: str) -> list[Gap]:
-        """Return the parts of a target that were not imaged, the largest first."""
+        """The parts of a target that were not imaged, the largest first."""
         missing = self.targets[target] & ~self.seen
         parts, count = label(missing)
         thickness = 2 * VOXEL_MM * distance_transform_edt(missing)
-        found = []
+        gaps = []
         for part in range(1, count + 1):
             mask = parts == part
             volume = float(mask.sum()) * VOXEL_MM**3 / 1000
             if volume >= MIN_GAP_ML:
-                found.append(Gap(volume, float(thickness[mask].max())))
-        return sorted(found, key=lambda gap: -gap.volume_ml)
+                gaps.append(Gap(volume, float(thickness[mask].max())))
+        return sorted(gaps, key=lambda gap: -gap.volume_ml)
 
     def is_seen(self, points_mm: np.ndarray) -> np.ndarray:
         """Whether the tissue at rest positions (n, 3) was imaged."""
@@ -134,9 +134,7 @@ class Coverage:
 
 @lru_cache(maxsize=4)
 def _scanlines_of(probe: Probe, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the scanline of each of count x count points of an image, and whether the point is in the
-    sector.
-    """
+    """The scanline of each of count x count points of an image, and whether the point is in the sector."""
     width, depth, above = probe.extent_mm
     share = np.linspace(0.0, 1.0, count)
     line, along = probe.beam_coordinates(*np.meshgrid(width * (share - 0.5), depth * share - above))

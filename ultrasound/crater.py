@@ -49,8 +49,8 @@ class Crater:
         """
         low = self.surface.bounds[0] - NEAR_MM
         shape = tuple(np.ceil((self.surface.bounds[1] + NEAR_MM - low) / FINE_MM).astype(int) + 1)
-        given = self.surface.vertices, self.surface.faces, low, shape, FINE_MM, NEAR_MM
-        return clipped_distance_grid(*given), low
+        arguments = self.surface.vertices, self.surface.faces, low, shape, FINE_MM, NEAR_MM
+        return clipped_distance_grid(*arguments), low
 
     def _voxels(self, volume: SampledVolume) -> tuple[Box, np.ndarray]:
         """The voxels of a volume in it and around it, and their places (nx, ny, nz, 3) [mm]."""
@@ -80,6 +80,6 @@ class Crater:
         remains.
         """
         box, places = self._voxels(volume)
-        given = self.surface.vertices, self.surface.faces, places.reshape(-1, 3)
-        distance = signed_distance(*given)[0].reshape(places.shape[:3])
+        arguments = self.surface.vertices, self.surface.faces, places.reshape(-1, 3)
+        distance = signed_distance(*arguments)[0].reshape(places.shape[:3])
         return box, np.maximum(volume.values(box), -distance)

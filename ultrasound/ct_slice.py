@@ -27,7 +27,7 @@ class CTSlice:
         self.organ_alone, self.outside_hu = outside_hu is not None, outside_hu or 0.0
 
     def render(self, window_hu: float, level_hu: float) -> np.ndarray:
-        """Return grey values (rows, columns) uint8 at pixel centres, 0 to 255 over the window."""
+        """Grey values (rows, columns) uint8 at pixel centres, 0 to 255 over the window."""
         image = np.empty(self.plane.shape, np.uint8)
         self._window(*self.plane.grid_mm, window_hu, level_hu, image)
         return image
@@ -51,7 +51,7 @@ class CTSlice:
 
     @ti.func
     def hounsfield(self, row, first, pixel_mm, first_mm, last):
-        """Return HU of LANES pixels of a row, whose last column is ``last``."""
+        """HU of LANES pixels of a row, whose last column is ``last``."""
         x, y, z, in_line = self.plane.rest_lanes(row, first, pixel_mm, first_mm, last)
         hu = self.ct.sample_lanes(x, y, z, in_line)
         if ti.static(self.organ_alone):

@@ -62,7 +62,7 @@ def save_dicom(
     data.BurnedInAnnotation = "NO"
     data.LossyImageCompression = "00"
     # Not part of this IOD, which has the region's deltas, but read by ITK.
-    data.PixelSpacing = [DS(float(each), auto_format=True) for each in spacing_mm]
+    data.PixelSpacing = [DS(float(mm), auto_format=True) for mm in spacing_mm]
     data.SequenceOfUltrasoundRegions = [_region(image.shape, spacing_mm, probe)]
     if probe is not None:
         data.TransducerType = TRANSDUCER_TYPES[probe.transducer_geometry]
@@ -79,11 +79,11 @@ def save_dicom(
 
 
 def _region(shape: tuple[int, ...], spacing_mm: tuple[float, float], probe: Probe | None) -> Dataset:
-    """Return the whole image as one region; its reference pixel contains the centre of the face, where (u,
-    v) is 0 [cm].
+    """The whole image as one region; its reference pixel contains the centre of the face, where (u, v) is 0
+    [cm].
     """
     rows, columns = shape[:2]
-    row_cm, column_cm = (float(each) / 10 for each in spacing_mm)
+    row_cm, column_cm = (float(mm) / 10 for mm in spacing_mm)
     region = Dataset()
     region.RegionSpatialFormat = REGION_2D
     region.RegionDataType = REGION_TISSUE if len(shape) == 2 else REGION_COLOUR_FLOW

@@ -53,13 +53,13 @@ STEPS = 64
 
 
 def colour_table(stops: np.ndarray) -> np.ndarray:
-    """Return the colours (STEPS + 1, 3) of a scale, between evenly spaced stops."""
+    """The colours (STEPS + 1, 3) of a scale, between evenly spaced stops."""
     at = np.linspace(0, len(stops) - 1, STEPS + 1)
     return np.stack([np.interp(at, np.arange(len(stops)), stops[:, k]) for k in range(3)], axis=-1)
 
 
 def scale_colours(mode: DopplerMode) -> np.ndarray:
-    """Return the colours of a mode's scale from the top (n, 3) uint8."""
+    """The colours of a mode's scale from the top (n, 3) uint8."""
     top = POWER if mode == "power" else TOWARDS
     below = [] if mode == "power" else [colour_table(AWAY)]
     return np.concatenate([colour_table(top)[::-1], *below]).astype(np.uint8)
@@ -90,8 +90,7 @@ class Doppler:
     def render(
         self, probe: Probe, grey: np.ndarray, mode: DopplerMode, time_s: float = 0.0, clamped: bool = False
     ) -> np.ndarray:
-        """Return an image (rows, columns, 3) uint8: a B-mode image ``grey`` of the plane, with Doppler over
-        it.
+        """An image (rows, columns, 3) uint8: a B-mode image ``grey`` of the plane, with Doppler over it.
 
         The B-mode image must have been rendered last for the same probe. ``time_s`` is that of the heart.
         Blood of a clamped kidney rests; beyond the clamp it flows on.
@@ -99,7 +98,7 @@ class Doppler:
         self.estimate(probe, time_s, clamped)
         power = mode == "power"
         scales = (POWER, POWER) if power else (TOWARDS, AWAY)
-        fill((self.colour, np.stack([colour_table(each) for each in scales])))
+        fill((self.colour, np.stack([colour_table(scale) for scale in scales])))
         threshold_db = THRESHOLD_DB - (probe.colour_gain_percent - 50) / 100 * GAIN_RANGE_DB
         threshold = noise_energy(probe) * 10 ** (threshold_db / 10)
         image = np.empty((*grey.shape, 3), np.uint8)
@@ -129,18 +128,18 @@ class Doppler:
         self._average(*self._sample_volume(probe), 0.0, 0.0, 0)
 
     def _sample_volume(self, probe: Probe) -> tuple[int, int]:
-        """Return the number of tissue samples of a scanline, and half of those of the sample volume."""
+        """The number of tissue samples of a scanline, and half of those of the sample volume."""
         stride = self.sound.stride_of(probe)
         gate = max(round(GATE_MM / (2 * stride * probe.sample_mm)), 0)
         return probe.number_of_samples_per_scanline // stride + 1, gate
 
     def velocity_cm_s(self, probe: Probe) -> np.ndarray:
-        """Return the velocity towards the array (scanlines, samples) [cm/s] of the last estimate, aliased."""
+        """The velocity towards the array (scanlines, samples) [cm/s] of the last estimate, aliased."""
         real, imaginary, _ = np.moveaxis(array_of(self.mean), -1, 0)
         return np.arctan2(imaginary, real) / np.pi * probe.velocity_limit_cm_s
 
     def _steered(self, probe: Probe) -> Probe:
-        """Return the probe with the scanlines of Doppler."""
+        """The probe with the scanlines of Doppler."""
         if self.sound is self.bmode.sound:
             return probe
         return probe.model_copy(update={"steering_deg": probe.colour_steering_deg})
@@ -190,8 +189,7 @@ class Doppler:
 
     @ti.func
     def towards_array(self, line, k, velocity):
-        """Return the component towards the array of a velocity along the rest axes, carried by the deformed
-        tissue.
+        """The component towards the array of a velocity along the rest axes, carried by the deformed tissue.
 
         The tissue turns the velocity; its size stays.
         """
@@ -222,7 +220,7 @@ class Doppler:
 
     @ti.func
     def noise_at(self, line, k, key):
-        """Return noise (2,) of unit mean square that changes with the key, as wide as a beam."""
+        """Noise (2,) of unit mean square that changes with the key, as wide as a beam."""
         at = line / NOISE_LINES
         first = ti.cast(at, ti.i32)
         # Another part of the block for each of its three axes' SIZE shifts.
@@ -262,7 +260,7 @@ class Doppler:
 
     @ti.func
     def mean_at(self, line, k):
-        """Return ``mean`` at a fractional scanline and tissue sample."""
+        """``mean`` at a fractional scanline and tissue sample."""
         x, y = tm.clamp(line, 0.0, self.lines - 1.001), tm.clamp(k, 0.0, self.sound.most - 1.001)
         i, j = ti.cast(x, ti.i32), ti.cast(y, ti.i32)
         low = tm.mix(self.mean[i, j], self.mean[i, j + 1], y - j)
@@ -270,8 +268,8 @@ class Doppler:
 
 
 def autocorrelation(iq: np.ndarray) -> np.ndarray:
-    """Return the moments (.., 3) of the echoes (.., pulses) of successive pulses: real and imaginary part of
-    the autocorrelation from one pulse to the next, and the energy (Kasai et al. 1985).
+    """The moments (.., 3) of the echoes (.., pulses) of successive pulses: real and imaginary part of the
+    autocorrelation from one pulse to the next, and the energy (Kasai et al. 1985).
 
     Of a signal whose phase grows as the echo comes earlier, as demodulated by exp(-i w t), the phase is that
     of a velocity towards the array.
@@ -281,12 +279,12 @@ def autocorrelation(iq: np.ndarray) -> np.ndarray:
 
 
 def noise_energy(probe: Probe) -> float:
-    """Return the energy of noise in an estimate, relative to the echo of a perfect reflector at the face."""
+    """The energy of noise in an estimate, relative to the echo of a perfect reflector at the face."""
     return float(10 ** ((probe.noise_before_gain_db - NARROW_BAND_DB) / 10) / ENSEMBLE)
 
 
 def doppler_shift_khz(probe: Probe, velocity_cm_s: float) -> float:
-    """Return the Doppler shift of a velocity towards the array: 2 f v / c."""
+    """The Doppler shift of a velocity towards the array: 2 f v / c."""
     return 2 * probe.frequency_mhz * velocity_cm_s / 100 / SOUND_MM_US
 
 

@@ -37,7 +37,7 @@ class GroundTruthLabels:
             self.bead = field_of(np.asarray(beads, float), 1)
 
     def render(self) -> np.ndarray:
-        """Return labels (rows, columns) uint8."""
+        """Labels (rows, columns) uint8."""
         image = np.empty(self.plane.shape, np.uint8)
         self._render(image)
         return image

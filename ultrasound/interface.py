@@ -36,9 +36,7 @@ class Surface:
     scattered_hard: float = 0.7
 
     def mirror_and_diffuse(self, wavelength_mm: float) -> tuple[float, float]:
-        """Return the amplitudes, of 1, that it reflects as a mirror and diffusely (Beckmann & Spizzichino
-        1963).
-        """
+        """The amplitudes, of 1, that it reflects as a mirror and diffusely (Beckmann & Spizzichino 1963)."""
         phase = (4 * np.pi / wavelength_mm * self.roughness_mm) ** 2
         return float(np.exp(-phase / 2)), float(np.sqrt(-np.expm1(-phase)))
 

@@ -61,9 +61,7 @@ def iq_signal(
     before: ImagePlane | None,
     phase_reference: int = 0,
 ) -> IQSignal:
-    """Return the signals of IQ (scanlines, samples) of tissue at rest positions (scanlines, samples, 3)
-    [mm].
-    """
+    """The signals of IQ (scanlines, samples) of tissue at rest positions (scanlines, samples, 3) [mm]."""
     iq, rest_mm = iq.T.astype(np.complex64), np.swapaxes(rest_mm, 0, 1)
     rf, rf_sampling_mhz = rf_of(iq, probe)
     start, direction = probe.scanlines()
@@ -86,8 +84,8 @@ def iq_signal(
 
 
 def rf_of(iq: np.ndarray, probe: Probe) -> tuple[np.ndarray, float]:
-    """Return the RF signal (RF samples, scanlines) float32 of IQ (samples, scanlines), and its sampling
-    frequency [MHz].
+    """The RF signal (RF samples, scanlines) float32 of IQ (samples, scanlines), and its sampling frequency
+    [MHz].
     """
     duration_us = 2 * probe.depth_mm / SOUND_MM_US
     count = round(RF_PER_PERIOD * probe.frequency_mhz * duration_us)
@@ -99,7 +97,7 @@ def rf_of(iq: np.ndarray, probe: Probe) -> tuple[np.ndarray, float]:
 
 
 def _on(plane: ImagePlane, places_mm: np.ndarray) -> np.ndarray:
-    """Return points (.., 3) of the world on the axes of an image plane [mm]."""
+    """Points (.., 3) of the world on the axes of an image plane [mm]."""
     matrix = np.linalg.inv(plane.world_from_plane)
     return places_mm @ matrix[:3, :3].T + matrix[:3, 3]
 

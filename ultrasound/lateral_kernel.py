@@ -17,20 +17,20 @@ GROUP = 8
 
 
 def scanline_classes(probe: Probe) -> tuple[np.ndarray, np.ndarray]:
-    """Return class of each scanline, and 1 or, where the profile is mirrored, -1; each (scanlines,) int32."""
+    """Class of each scanline, and 1 or, where the profile is mirrored, -1; each (scanlines,) int32."""
     off = 2 * (np.arange(probe.number_of_scanlines) + 0.5) / probe.number_of_scanlines - 1
     classes = np.minimum(np.abs(off) * CLASSES, CLASSES - 1).astype(np.int32)
     return classes, np.where(off < 0, -1, 1).astype(np.int32)
 
 
 def packet_depths(probe: Probe) -> np.ndarray:
-    """Return the depth [mm] of the middle of each LANES samples."""
+    """The depth [mm] of the middle of each LANES samples."""
     packets = probe.number_of_samples_per_scanline // LANES
     return (np.arange(packets) + 0.5) * LANES * probe.sample_mm
 
 
 def lateral_kernel(probe: Probe) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the weights of neighbouring scanlines for each class of scanlines and LANES samples.
+    """The weights of neighbouring scanlines for each class of scanlines and LANES samples.
 
     Weights (CLASSES, packets, 2 MAX_HALF_WIDTH + 1), of sum 1; the half width in scanlines (CLASSES,
     packets); and the speckle gain (CLASSES, packets), which restores unit mean square of noise with the
@@ -39,10 +39,10 @@ def lateral_kernel(probe: Probe) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     depth, lag = packet_depths(probe), np.arange(-MAX_HALF_WIDTH, MAX_HALF_WIDTH + 1)
     # The noise already has the width of the pulse in every direction.
     pulse = probe.speckle_sd_mm / np.maximum(probe.line_spacing_mm(depth), 1e-6)
-    profiles = np.stack([_profiles(probe, each, lag, depth) for each in range(CLASSES)])
+    profiles = np.stack([_profiles(probe, scanline_class, lag, depth) for scanline_class in range(CLASSES)])
     weights = np.empty_like(profiles)
-    for each in np.ndindex(profiles.shape[:2]):
-        weights[each] = narrowed(profiles[each], pulse[each[1]])
+    for index in np.ndindex(profiles.shape[:2]):
+        weights[index] = narrowed(profiles[index], pulse[index[1]])
     outside = weights < LEAST
     half = MAX_HALF_WIDTH - np.minimum(outside.argmin(axis=-1), outside[..., ::-1].argmin(axis=-1))
     weights[np.abs(lag) > half[..., None]] = 0.0
@@ -55,8 +55,8 @@ def lateral_kernel(probe: Probe) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def narrowed(profile: np.ndarray, pulse_sd: float) -> np.ndarray:
-    """Return the kernel that makes noise of an SD [scanlines] as wide as a profile (2 n + 1,), as far as
-    that is possible.
+    """The kernel that makes noise of an SD [scanlines] as wide as a profile (2 n + 1,), as far as that is
+    possible.
     """
     lag = np.arange(len(profile)) - len(profile) // 2
     fine = np.linspace(lag[0], lag[-1], 20 * len(lag))
@@ -65,17 +65,17 @@ def narrowed(profile: np.ndarray, pulse_sd: float) -> np.ndarray:
     return np.interp(lag / ratio, lag, profile, left=0.0, right=0.0)
 
 
-def _profiles(probe: Probe, each: int, lag: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
-    """Return the profile of a class (depths, lags)."""
+def _profiles(probe: Probe, scanline_class: int, lag: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
+    """The profile of a class (depths, lags)."""
     nodes = profile_depths(probe)
-    scanline = ((each + 0.5) / CLASSES + 1) / 2 * probe.number_of_scanlines - 0.5
+    scanline = ((scanline_class + 0.5) / CLASSES + 1) / 2 * probe.number_of_scanlines - 0.5
     at_nodes = lateral_profiles(probe, scanline, nodes, lag)
     return np.stack([np.interp(depth_mm, nodes, profile) for profile in at_nodes.T], axis=-1)
 
 
 def clutter_weights(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
-    """Return the energy that side lobes receive from groups of GROUP scanlines beside a scanline's group,
-    (depths, 2 groups - 1).
+    """The energy that side lobes receive from groups of GROUP scanlines beside a scanline's group, (depths, 2
+    groups - 1).
 
     Relative to the energy within the kernel, of a scanline in the middle; nothing within the kernel.
     """
@@ -91,4 +91,4 @@ def clutter_weights(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
     share = np.zeros((len(nodes), groups))
     share[:, beyond] = energy.reshape(len(nodes), len(beyond), -1).mean(axis=2) * GROUP / main[:, None]
     both = np.concatenate([share[:, :0:-1], share], axis=1)
-    return np.stack([np.interp(depth_mm, nodes, each) for each in both.T], axis=-1)
+    return np.stack([np.interp(depth_mm, nodes, profile) for profile in both.T], axis=-1)

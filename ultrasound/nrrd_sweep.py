@@ -67,7 +67,7 @@ def read_nrrd(file: BinaryIO) -> Sweep:
     fields, own, numbered = _read_header(file)
     own = _renamed(own, METAFILE_NAMES)
     columns, rows, count = _sizes(fields)
-    frames = [_renamed(each, {STATUS: METAFILE_STATUS}) for each in in_order(numbered, count, "sizes")]
+    frames = [_renamed(frame, {STATUS: METAFILE_STATUS}) for frame in in_order(numbered, count, "sizes")]
     # PLUS writes an empty pixel a frame where there are only poses.
     if columns * rows == 0 or (columns * rows == 1 and METAFILE_NAMES[ORIENTATION] not in own):
         return Sweep(np.empty((count, 0, 0), np.uint8), frames, own)
@@ -80,12 +80,10 @@ def read_nrrd(file: BinaryIO) -> Sweep:
 
 
 def nrrd_header(own: Mapping[str, str], shape: tuple[int, int], count: int) -> bytes:
-    """The lines of a header up to those of the frames.
+    """The lines of a header up to those of the ``count`` frames.
 
-    Args:
-        own: fields that are not of a format; of the others only orientation and type of the image count.
-        shape: rows and columns of an image; (0, 0) for poses alone.
-        count: number of frames.
+    ``own`` are fields that are not of a format; of the others only orientation and type of the image count.
+    ``shape`` is rows and columns of an image, (0, 0) for poses alone.
     """
     rows, columns = shape if any(shape) else (1, 1)
     header = NEW_HEADER.format(columns=columns, rows=rows, count=count).encode()
@@ -166,9 +164,9 @@ def _read_pixels(file: BinaryIO, fields: dict[str, str], size: int) -> bytes:
                 f"{name} = {reprlib.repr(fields[name])}: expected the pixels right after the header"
             )
     if encoding == "raw":
-        found = os.fstat(file.fileno()).st_size - file.tell()
-        if found != size:
-            raise SweepError(f"{found} bytes of pixels: expected {size}")
+        remaining = os.fstat(file.fileno()).st_size - file.tell()
+        if remaining != size:
+            raise SweepError(f"{remaining} bytes of pixels: expected {size}")
         return file.read(size)
     try:
         with gzip.GzipFile(fileobj=file) as packed:

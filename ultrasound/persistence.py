@@ -15,7 +15,7 @@ class Persistence:
         self._shows: tuple = ()
 
     def mixed(self, images: PlaneImages, share: float) -> PlaneImages:
-        """Return the images, their B-mode image with a share (0 to 1) of the mean before.
+        """The images, their B-mode image with a share (0 to 1) of the mean before.
 
         The mean begins anew where shape, probe or crater differ from those of the last image, and after
         images without a share or without a B-mode image.

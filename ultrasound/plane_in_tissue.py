@@ -57,8 +57,10 @@ class PlaneInTissue:
         fill((self.grid, np.stack([pixel, first])), (self._last, np.array([rows - 1, columns - 1])))
         self._rest_grids.clear()
         self.noise_key = zlib.crc32(np.asarray(plane.world_from_plane, np.float32).tobytes()) & 0xFFFF
-        given = np.linalg.inv(plane.world_from_plane), plane.world_from_plane, pixel, first
-        inverse, world, pixel_mm, first_mm = (ti.Matrix(np.asarray(each, float).tolist()) for each in given)
+        arrays = np.linalg.inv(plane.world_from_plane), plane.world_from_plane, pixel, first
+        inverse, world, pixel_mm, first_mm = (
+            ti.Matrix(np.asarray(array, float).tolist()) for array in arrays
+        )
         self.embedding.locate_on_plane(inverse, world, pixel_mm, first_mm, rows, columns, self.owner)
 
     @property
@@ -68,7 +70,7 @@ class PlaneInTissue:
         return tm.vec2(*pixel), tm.vec2(*first)
 
     def rest_grid(self, count: int) -> np.ndarray:
-        """Return rest positions (count, count, 3) [mm] at pixels evenly over the plane, whatever the shape.
+        """Rest positions (count, count, 3) [mm] at pixels evenly over the plane, whatever the shape.
 
         They are not to be changed.
         """
@@ -91,7 +93,7 @@ class PlaneInTissue:
 
     @ti.func
     def rest_at(self, row, column, pixel_mm, first_mm):
-        """Return the rest position of the tissue at a pixel's centre [mm]; the last two are ``grid``."""
+        """The rest position of the tissue at a pixel's centre [mm]; the last two are ``grid``."""
         linear = self.embedding.rest_from_plane[self.owner[row, column]]
         u, v = first_mm.x + column * pixel_mm.x, first_mm.y + row * pixel_mm.y
         return linear[:, 0] * u + linear[:, 1] * v + linear[:, 3]
@@ -121,14 +123,14 @@ class PlaneInTissue:
 
     @ti.func
     def pixel_near(self, place):
-        """Return row and column of the pixel nearest to (u, v) [mm]."""
+        """Row and column of the pixel nearest to (u, v) [mm]."""
         at = ti.round((place - self.grid[1]) / self.grid[0], ti.i32)
         last = self._last[None]
         return tm.clamp(at.y, 0, last[0]), tm.clamp(at.x, 0, last[1])
 
     @ti.func
     def rest_from_plane(self, row, column):
-        """Return the map (3, 4) from (u, v, w, 1) of the plane to the rest position [mm], at a pixel."""
+        """The map (3, 4) from (u, v, w, 1) of the plane to the rest position [mm], at a pixel."""
         return self.embedding.rest_from_plane[self.owner[row, column]]
 
     @ti.func

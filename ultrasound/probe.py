@@ -253,8 +253,8 @@ class Probe(Section):
         return float(2 * half), float(self.depth_mm + above), float(above)
 
     def image_to_probe(self, rows: int, columns: int) -> np.ndarray:
-        """Return the matrix (4, 4) from pixels (column, row, 0), counted from the first one's centre, to the
-        probe's axes [mm].
+        """The matrix (4, 4) from pixels (column, row, 0), counted from the first one's centre, to the probe's
+        axes [mm].
 
         The axes are PLUS's: origin at the centre of the array face, x to the marked side, y into the tissue.
         """
@@ -264,7 +264,7 @@ class Probe(Section):
         return matrix
 
     def scanlines(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return start [mm] and unit direction of each scanline, each (scanlines, 2) on the image plane."""
+        """Start [mm] and unit direction of each scanline, each (scanlines, 2) on the image plane."""
         steering = np.radians(self.steering_deg)
         if self.sector is None:
             return self.elements(), np.tile(
@@ -274,13 +274,13 @@ class Probe(Section):
         share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines
         angle = start + share * (stop - start)
         normal, direction = (
-            np.column_stack([np.sin(each), np.cos(each)]) for each in (angle, angle + steering)
+            np.column_stack([np.sin(radians), np.cos(radians)]) for radians in (angle, angle + steering)
         )
         return radius * (normal - [0.0, 1.0]), direction
 
     def elements(self) -> np.ndarray:
-        """Return the elements on the face (scanlines, 2) [mm]: the starts of the scanlines, or across a
-        phased array.
+        """The elements on the face (scanlines, 2) [mm]: the starts of the scanlines, or across a phased
+        array.
         """
         if self.transducer_geometry == "CURVILINEAR":
             return self.scanlines()[0]
@@ -288,14 +288,14 @@ class Probe(Section):
         return np.column_stack([share * self.transducer_width_mm, np.zeros_like(share)])
 
     def line_spacing_mm(self, depth_mm: np.ndarray) -> np.ndarray:
-        """Return the distance of neighbouring scanlines at depths [mm]."""
+        """The distance of neighbouring scanlines at depths [mm]."""
         if self.transducer_geometry == "LINEAR":
             return np.full_like(depth_mm, self.transducer_width_mm / self.number_of_scanlines)
         step = np.radians(self.theta_stop_deg - self.theta_start_deg) / self.number_of_scanlines
         return (self.radius_mm + depth_mm) * step
 
     def beam_coordinates(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return scanline (fractional index) and depth along it [mm] of points on the plane [mm]."""
+        """Scanline (fractional index) and depth along it [mm] of points on the plane [mm]."""
         steering = np.radians(self.steering_deg)
         if self.sector is None:
             at_face = u - v * np.tan(steering)
@@ -310,7 +310,7 @@ class Probe(Section):
         return share * self.number_of_scanlines - 0.5, depth
 
     def gain_db(self) -> np.ndarray:
-        """Return gain and TGC at each sample of a scanline [dB], (samples,)."""
+        """Gain and TGC at each sample of a scanline [dB], (samples,)."""
         depth = (np.arange(self.number_of_samples_per_scanline) + 0.5) * self.sample_mm
         path = 2 * self.depth_compensation_db_cm_mhz * depth / 10 / DB_OF_NEPER
         loss = self.pulse.speckle_db
@@ -329,13 +329,13 @@ class ScannerSettings(Section):
 
 
 def load_probe(name: str) -> Probe:
-    """Return a built-in probe by name, else the probe of a file. Raises ProbeError."""
+    """A built-in probe by name, else the probe of a file. Raises ProbeError."""
     built_in = PROBES / f"{name}.toml"
     path = built_in if built_in.is_file() else Path(name)
     try:
         return probe_of_values(read_toml(path))
     except (FileNotFoundError, NotADirectoryError):
-        known = ", ".join(sorted(each.stem for each in PROBES.glob("*.toml")))
+        known = ", ".join(sorted(file.stem for file in PROBES.glob("*.toml")))
         raise ProbeError(f"transducer.probe: {name!r} is no file, and known by name are {known}") from None
     except TextError as error:
         raise ProbeError(
@@ -346,14 +346,14 @@ def load_probe(name: str) -> Probe:
 
 
 def probe_of_values(values: Mapping[str, object]) -> Probe:
-    """Return the probe of a file's values. Raises ProbeError, which names the key."""
+    """The probe of a file's values. Raises ProbeError, which names the key."""
     for key in FORMER_KEYS.keys() & values.keys():
         raise ProbeError(f"{key} no longer exists; delete it ({FORMER_KEYS[key]} sets the same)")
     return _validated(values)
 
 
 def changed_probe(probe: Probe, **changes: object) -> Probe:
-    """Return a probe with some fields changed. Raises ProbeError where they do not fit together."""
+    """A probe with some fields changed. Raises ProbeError where they do not fit together."""
     return _validated(probe.model_dump() | changes)
 
 

@@ -46,9 +46,7 @@ def array_face_centre(pose: np.ndarray, length_mm: float) -> np.ndarray:
 def pose_at(
     face_centre: np.ndarray, direction: np.ndarray, lateral: np.ndarray, length_mm: float
 ) -> np.ndarray:
-    """Return the pose with its face centred at a point [mm], beam along ``direction``, x nearest to
-    ``lateral``.
-    """
+    """The pose with its face centred at a point [mm], beam along ``direction``, x nearest to ``lateral``."""
     z = -np.asarray(direction, float) / np.linalg.norm(direction)
     x = np.asarray(lateral, float) - np.dot(lateral, z) * z
     if np.linalg.norm(x) < 1e-6:
@@ -59,7 +57,7 @@ def pose_at(
 
 
 def rigid(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Return matrices (..., 4, 4) of rotations (..., 3, 3) and positions (..., 3)."""
+    """Matrices (..., 4, 4) of rotations (..., 3, 3) and positions (..., 3)."""
     matrix = np.zeros((*position.shape[:-1], 4, 4))
     matrix[..., :3, :3], matrix[..., :3, 3], matrix[..., 3, 3] = rotation, position, 1.0
     return matrix
@@ -68,26 +66,24 @@ def rigid(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
 def image_plane(
     pose: np.ndarray, length_mm: float, width_mm: float, depth_mm: float, above_mm: float = 0.0
 ) -> ImagePlane:
-    """Return the image plane of a pose: x to the marked side, y down into the tissue, origin at the face."""
+    """The image plane of a pose: x to the marked side, y down into the tissue, origin at the face."""
     return ImagePlane(pose @ _face(length_mm), width_mm, depth_mm, above_mm)
 
 
 def pose_of_image_plane(world_from_plane: np.ndarray, length_mm: float) -> np.ndarray:
-    """Return the pose of the transducer with a given image plane (4, 4), whose axes are PLUS's axes of a
-    probe.
-    """
+    """The pose of the transducer with a given image plane (4, 4), whose axes are PLUS's axes of a probe."""
     return world_from_plane @ np.linalg.inv(_face(length_mm))
 
 
 def _face(length_mm: float) -> np.ndarray:
-    """Return the transform from the image plane's axes to the transducer's."""
+    """The transform from the image plane's axes to the transducer's."""
     return np.array(
         [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, -length_mm / 2], [0.0, 0.0, 0.0, 1.0]]
     )
 
 
 def indentation(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray, radius_mm: float = 0.0) -> float:
-    """Return the depth [mm] of the array face below the highest point (n, 3) of the settled surface under its
+    """The depth [mm] of the array face below the highest point (n, 3) of the settled surface under its
     footprint.
 
     Negative above the surface; -inf where the footprint misses it. The face is flat, or an arc of a radius.
@@ -109,7 +105,7 @@ def _near_footprint(pose: np.ndarray, half_mm: np.ndarray, surface: np.ndarray) 
 
 
 def sagitta(x_mm: np.ndarray, radius_mm: float) -> np.ndarray:
-    """Return how far a face of a radius (0: flat) is behind its centre, at lateral positions [mm]."""
+    """How far a face of a radius (0: flat) is behind its centre, at lateral positions [mm]."""
     if radius_mm == 0:
         return np.zeros_like(x_mm)
     return radius_mm - np.sqrt(np.maximum(radius_mm**2 - x_mm**2, 0.0))
@@ -118,27 +114,27 @@ def sagitta(x_mm: np.ndarray, radius_mm: float) -> np.ndarray:
 def touching(
     pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray, radius_mm: float = 0.0
 ) -> np.ndarray:
-    """Return the pose moved along its axis to first contact with the settled surface (n, 3)."""
+    """The pose moved along its axis to first contact with the settled surface (n, 3)."""
     depth = indentation(pose, size_mm, surface, radius_mm)
     return advanced(pose, -depth) if np.isfinite(depth) else pose.copy()
 
 
 def advanced(pose: np.ndarray, depth_mm: float) -> np.ndarray:
-    """Return the pose moved by a depth along the beam [mm]."""
+    """The pose moved by a depth along the beam [mm]."""
     moved = pose.copy()
     moved[:3, 3] -= depth_mm * pose[:3, 2]
     return moved
 
 
 def poses_between(start: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
-    """Return poses (count + 1, 4, 4) evenly from start to end, as ``interpolated``."""
+    """Poses (count + 1, 4, 4) evenly from start to end, as ``interpolated``."""
     if count == 1:
         return np.stack([start, end])
     return interpolated(start, end, np.linspace(0.0, 1.0, count + 1))
 
 
 def moved_towards(pose: np.ndarray, goal: np.ndarray, max_mm: float, max_deg: float) -> np.ndarray:
-    """Return the pose moved towards a goal by at most a distance [mm] and an angle [degrees]."""
+    """The pose moved towards a goal by at most a distance [mm] and an angle [degrees]."""
     distance = float(np.linalg.norm(goal[:3, 3] - pose[:3, 3]))
     turn = np.degrees(Rotation.from_matrix(goal[:3, :3] @ pose[:3, :3].T).magnitude())
     share = min(1.0, max_mm / max(distance, 1e-9), max_deg / max(turn, 1e-9))
@@ -146,8 +142,8 @@ def moved_towards(pose: np.ndarray, goal: np.ndarray, max_mm: float, max_deg: fl
 
 
 def interpolated(start: np.ndarray, end: np.ndarray, share: float | np.ndarray) -> np.ndarray:
-    """Return the pose (4, 4), or poses (n, 4, 4), at a fraction (0 to 1), or fractions (n,), of the path from
-    start to end.
+    """The pose (4, 4), or poses (n, 4, 4), at a fraction (0 to 1), or fractions (n,), of the path from start
+    to end.
 
     Positions are interpolated linearly, rotations spherically.
     """
@@ -229,23 +225,23 @@ class ProbeManipulator:
         self.state = replace(self.state, aim=aim)
 
     def surface_normal(self, point: np.ndarray) -> np.ndarray:
-        """Return the unit normal (3,) of the surface patch around a point [mm]."""
+        """The unit normal (3,) of the surface patch around a point [mm]."""
         return self.surface_normals(point[None])[0]
 
     def surface_normals(self, points: np.ndarray) -> np.ndarray:
-        """Return the unit normals (n, 3) of the surface patches around points (n, 3) [mm]."""
+        """The unit normals (n, 3) of the surface patches around points (n, 3) [mm]."""
         normal = np.exp(-((cdist(points, self.vertices) / NORMAL_PATCH_MM) ** 2)) @ self.normals
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def ray_hit(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
-        """Return the first intersection (3,) of a ray [mm] with the settled organ, None where it misses."""
+        """The first intersection (3,) of a ray [mm] with the settled organ, None where it misses."""
         origin, direction = np.array(origin, float), np.array(direction, float)
         (distance,) = self.ray_distances(origin[None], direction[None])
         return origin + distance * direction if np.isfinite(distance) else None
 
     def ray_distances(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return the distances (n,), in lengths of the directions, of rays (n, 3) to the settled organ;
-        infinity where they miss.
+        """The distances (n,), in lengths of the directions, of rays (n, 3) to the settled organ; infinity
+        where they miss.
         """
         hit, distance, _ = self._tree.intersect_ray_first(self.vertices, self.faces, origins, directions)
         return np.where(hit >= 0, distance, np.inf)
@@ -289,14 +285,14 @@ class ProbeManipulator:
         self.state = replace(self.state, turn_deg=turn)
 
     def pose(self) -> np.ndarray:
-        """Return the commanded pose: turned about the face's centre, moved to contact, then pressed in."""
+        """The commanded pose: turned about the face's centre, moved to contact, then pressed in."""
         pose = self._turned(self.aim)
         depth = min(self.state.depth_mm + self.state.pressed_mm, self.max_mm)
         return advanced(touching(pose, self.size_mm, self.samples, self.radius_mm), depth)
 
     def pose_towards(self, goal: np.ndarray, pose: np.ndarray, time_s: float) -> np.ndarray:
-        """Return the pose after a time [s] from a pose towards a goal (4, 4): limited in speed, and not
-        through the organ.
+        """The pose after a time [s] from a pose towards a goal (4, 4): limited in speed, and not through the
+        organ.
         """
         moved = moved_towards(pose, goal, self.speed_mm_s * time_s, TURN_DEG_S * time_s)
         # The straight path between two points of the surface may cross the organ.

@@ -114,7 +114,7 @@ class Propagation:
         self.rays = ApertureRays(self.lines, self.most)
 
     def stride_of(self, probe: Probe) -> int:
-        """Return the scanline samples between two tissue samples."""
+        """The scanline samples between two tissue samples."""
         return STRIDES[0] if STRIDES[0] * probe.sample_mm <= self.voxel_mm else STRIDES[1]
 
     def set_probe(self, probe: Probe, slice_sd_mm: np.ndarray) -> None:
@@ -197,39 +197,39 @@ class Propagation:
         clear_mm = 0.0
         for k in range(count):
             planes = ti.static(THICK_PLANE if thick else CENTRAL_PLANE)
-            found = self.tissue_at(planes, self.start[line] + depth * self.direction[line], self.slice_sd[k])
+            sample = self.tissue_at(planes, self.start[line] + depth * self.direction[line], self.slice_sd[k])
             self.capsule[line, k] = tm.vec4(0.0)
-            is_parenchyma = found.tissue.w > 0.5
+            is_parenchyma = sample.tissue.w > 0.5
             if k > 0 and (is_parenchyma or parenchyma_before):
-                clear_mm -= (found.rest - self.rest[line, k - 1]).norm()
+                clear_mm -= (sample.rest - self.rest[line, k - 1]).norm()
                 if clear_mm <= 0.0:
-                    before, after = self.organ.sample(self.rest[line, k - 1]), self.organ.sample(found.rest)
+                    before, after = self.organ.sample(self.rest[line, k - 1]), self.organ.sample(sample.rest)
                     if before * after < 0.0:
-                        self.add_capsule(line, k, found, before / (before - after), step_mm)
+                        self.add_capsule(line, k, sample, before / (before - after), step_mm)
                     clear_mm = ti.abs(after) - DISTANCE_ERROR_MM
             else:
                 clear_mm = 0.0
             parenchyma_before = is_parenchyma
             if ti.static(self.has_fluid):
                 if in_front:
-                    distance = self.organ.sample(found.rest)
+                    distance = self.organ.sample(sample.rest)
                     # Where a scanline passes the organ at a distance, what is behind is the organ's
                     # surroundings, no fluid on it.
                     in_front = distance > 0.0 and distance <= self.gap_mm
-                    if in_front and found.tissue.x > LEAST_FLUID_MRAYL:
-                        found.tissue = tm.vec4(self.fluid)
-            self.tissue[line, k] = found.tissue.xyz
-            if found.tissue.w > 0.0:
-                self.tissue[line, k].z *= self.anisotropy(found, self.direction[line])
-            self.rest[line, k] = found.rest
-            self.across[line, k] = found.linear[:, 2]
+                    if in_front and sample.tissue.x > LEAST_FLUID_MRAYL:
+                        sample.tissue = tm.vec4(self.fluid)
+            self.tissue[line, k] = sample.tissue.xyz
+            if sample.tissue.w > 0.0:
+                self.tissue[line, k].z *= self.anisotropy(sample, self.direction[line])
+            self.rest[line, k] = sample.rest
+            self.across[line, k] = sample.linear[:, 2]
             self.depth[line, k] = depth
-            depth += step_mm * speed_ratio(found.tissue.x)
+            depth += step_mm * speed_ratio(sample.tissue.x)
 
     @ti.func
-    def add_capsule(self, line, k, found, share, step_mm):
+    def add_capsule(self, line, k, sample, share, step_mm):
         """Write the echo of the renal capsule, which a scanline passes at a share of the way to a sample."""
-        normal = found.linear[:, :3].transpose() @ self.organ.slope(found.rest)
+        normal = sample.linear[:, :3].transpose() @ self.organ.slope(sample.rest)
         cosine = ti.abs(normal.dot(tm.vec3(self.direction[line], 0.0))) / ti.max(normal.norm(), 1e-9)
         tilt = ti.acos(ti.min(cosine, 1.0))
         amplitude = CAPSULE * ti.exp(-0.5 * (tilt / CAPSULE_TILT) ** 2)
@@ -244,21 +244,21 @@ class Propagation:
         return ti.abs(self.tissue[line, k].y - self.fluid[1]) < 1e-6
 
     @ti.func
-    def anisotropy(self, found, direction):
-        """Return the factor of backscattered amplitude where the beam meets tubules, which run to the
-        capsule, at an angle.
+    def anisotropy(self, sample, direction):
+        """The factor of backscattered amplitude where the beam meets tubules, which run to the capsule, at an
+        angle.
 
         Its mean over all directions, in dB, is 0.
         """
-        tubule = self.organ.slope(found.rest)
-        along = found.linear[:, 0] * direction.x + found.linear[:, 1] * direction.y
+        tubule = self.organ.slope(sample.rest)
+        along = sample.linear[:, 0] * direction.x + sample.linear[:, 1] * direction.y
         size = tubule.norm_sqr() * along.norm_sqr()
         squarely = 1.0 - tubule.dot(along) ** 2 / ti.max(size, 1e-12)
-        return ti.exp(found.tissue.w * (squarely - 2.0 / 3.0) / DB_OF_NEPER)
+        return ti.exp(sample.tissue.w * (squarely - 2.0 / 3.0) / DB_OF_NEPER)
 
     @ti.func
     def place(self, line, k):
-        """Return where on the image plane (u, v) [mm] a tissue sample is, fractional."""
+        """Where on the image plane (u, v) [mm] a tissue sample is, fractional."""
         first = ti.min(ti.cast(k, ti.i32), self.most - 2)
         depth = tm.mix(self.depth[line, first], self.depth[line, first + 1], k - first)
         return self.start[line] + depth * self.direction[line]
@@ -269,18 +269,18 @@ class Propagation:
         row, column = self.plane.pixel_near(place)
         linear = self.plane.rest_from_plane(row, column)
         rest = linear @ tm.vec4(place, 0.0, 1.0)
-        found, within = tm.vec4(0.0), 0.0
+        tissue, within = tm.vec4(0.0), 0.0
         for off, weight in ti.static(planes):
             there = self.tissue_volume.sample(rest + (off * slice_sd) * linear[:, 2])
-            found += weight * tm.vec4(there.x, there.y, there.z**2, there.w)
+            tissue += weight * tm.vec4(there.x, there.y, there.z**2, there.w)
             within += ti.select(there.x > 1e-6, weight, 0.0)
         # Half of a slice beyond the CT is no tissue of half the impedance.
-        found.x /= ti.max(within, 1e-6)
-        found.z = ti.sqrt(found.z)
+        tissue.x /= ti.max(within, 1e-6)
+        tissue.z = ti.sqrt(tissue.z)
         if ti.static(self.organ_alone):
             if not (self.plane.is_tissue(row, column) and self.organ.sample(rest) <= 0.0):
-                found = tm.vec4(self.around, 0.0, 0.0, 0.0)
-        return TissueSample(found, rest, linear)  # type: ignore[call-arg]
+                tissue = tm.vec4(self.around, 0.0, 0.0, 0.0)
+        return TissueSample(tissue, rest, linear)  # type: ignore[call-arg]
 
     @kernel
     def _find_interfaces(self, count: int, step_mm: float):
@@ -320,7 +320,7 @@ class Propagation:
 
     @ti.func
     def gradient_at(self, line, k):
-        """Return the gradient (u, v, w) of impedance halfway before a sample, in the deformed tissue."""
+        """The gradient (u, v, w) of impedance halfway before a sample, in the deformed tissue."""
         row, column = self.plane.pixel_near(self.place(line, k - 0.5))
         linear = self.plane.rest_from_plane(row, column)
         # Carried into the deformed tissue by the inverse transpose of the deformation gradient.
@@ -347,14 +347,14 @@ class Propagation:
 
     @ti.func
     def at_path(self, table: ti.template(), path):
-        """Return an entry of a table of ``beam.AttenuatedPulse`` for an attenuation of the path [Np/MHz]."""
+        """An entry of a table of ``beam.AttenuatedPulse`` for an attenuation of the path [Np/MHz]."""
         at = ti.min(path / PATH_STEP, PATH_ENTRIES - 1.001)
         first = ti.cast(at, ti.i32)
         return tm.mix(table[first], table[first + 1], at - first)
 
     @ti.func
     def echo_amplitude(self, path: ti.template(), line, echo, step_mm):
-        """Return the amplitude of a perfect reflector at an interface, and its path [Np/MHz].
+        """The amplitude of a perfect reflector at an interface, and its path [Np/MHz].
 
         ``path`` is that of the tissue samples. The tissue before the interface attenuates up to its depth.
         """

@@ -35,8 +35,8 @@ class AttenuatedPulse:
 
 
 def pulse_spectrum(frequency_mhz: float, bandwidth_percent: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return frequencies [MHz] and amplitudes of the echo of one cycle, transmitted and received by an array
-    of limited bandwidth.
+    """Frequencies [MHz] and amplitudes of the echo of one cycle, transmitted and received by an array of
+    limited bandwidth.
 
     The bandwidth is a generalized normal window of -6 dB width, zero at 0 and twice the centre frequency
     (Garcia 2022, SIMUS, Comput Methods Programs Biomed 218, 106726).
@@ -51,7 +51,7 @@ def pulse_spectrum(frequency_mhz: float, bandwidth_percent: float) -> tuple[np.n
 
 @lru_cache(32)
 def attenuated_pulse(frequency_mhz: float, bandwidth_percent: float) -> AttenuatedPulse:
-    """Return the tables of a pulse."""
+    """The tables of a pulse."""
     frequency, amplitude = pulse_spectrum(frequency_mhz, bandwidth_percent)
     path = PATH_STEP * np.arange(PATH_ENTRIES)[:, None]
     # The frequency that is attenuated least is divided out, as very small numbers lose digits.
@@ -67,16 +67,16 @@ def attenuated_pulse(frequency_mhz: float, bandwidth_percent: float) -> Attenuat
 
 
 def _lengths_mm(level: float, spectrum: np.ndarray, frequency: np.ndarray) -> np.ndarray:
-    """Return the distance (PATH_ENTRIES,) at which the envelope falls to a level; half of the round trip
-    is the distance.
+    """The distance (PATH_ENTRIES,) at which the envelope falls to a level; half of the round trip is the
+    distance.
     """
     entries = np.arange(0, PATH_ENTRIES, LENGTHS_EVERY)
-    at_entries = [_time_to(level, spectrum[each], frequency) * SOUND_MM_US / 2 for each in entries]
+    at_entries = [_time_to(level, spectrum[entry], frequency) * SOUND_MM_US / 2 for entry in entries]
     return np.interp(np.arange(PATH_ENTRIES), entries, at_entries)
 
 
 def _time_to(level: float, spectrum: np.ndarray, frequency: np.ndarray) -> float:
-    """Return the time [us] at which the envelope of a spectrum's signal falls to a level of its peak."""
+    """The time [us] at which the envelope of a spectrum's signal falls to a level of its peak."""
     count = 1 << 13
     envelope = np.abs(np.fft.fft(spectrum, count))
     limit = level * envelope[0]

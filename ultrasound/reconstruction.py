@@ -46,7 +46,7 @@ class VoxelBox:
 
     @classmethod
     def around(cls, corners_mm: np.ndarray, spacing_mm: float) -> "VoxelBox":
-        """Return the smallest box from the minimum of ``corners_mm`` (n, 3) that covers their maximum."""
+        """The smallest box from the minimum of ``corners_mm`` (n, 3) that covers their maximum."""
         counts = np.ceil(np.ptp(corners_mm, axis=0) / spacing_mm) + 1
         # Also a corner that is infinitely far away is beyond the limit.
         x, y, z = (int(n) for n in np.fmin(counts, MAX_VOXELS + 1))
@@ -60,7 +60,7 @@ class VoxelBox:
         return matrix
 
     def places(self) -> np.ndarray:
-        """Return the centres (x, y, z, 3) [mm] of all voxels."""
+        """The centres (x, y, z, 3) [mm] of all voxels."""
         return np.moveaxis(np.indices(self.shape), 0, -1) * self.spacing_mm + self.origin_mm
 
 
@@ -128,7 +128,7 @@ class Reconstruction:
         return ((voxel[0] * self._shape[1] + voxel[1]) * self._shape[2] + voxel[2]).astype(np.intp)
 
     def volume(self, reach_mm: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return values (x, y, z) float32 and the mask (x, y, z) of voxels with data or in a hole.
+        """Values (x, y, z) float32 and the mask (x, y, z) of voxels with data or in a hole.
 
         The mask is the closing, by a ball of ``reach_mm``, of the voxels with data: holes up to twice as wide
         are filled. Elsewhere values are 0.
@@ -147,9 +147,7 @@ class Reconstruction:
 
 
 def _filled(values: np.ndarray, seen: np.ndarray, reach: float, method: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return values (x, y, z) with holes filled, and the closing of ``seen`` (x, y, z) by ``reach``
-    voxels.
-    """
+    """Values (x, y, z) with holes filled, and the closing of ``seen`` (x, y, z) by ``reach`` voxels."""
     # Padding: without it the closing would include the border.
     margin = int(reach) + 2
     inner = (slice(margin, -margin),) * 3
@@ -187,8 +185,8 @@ def _gaussian(values: np.ndarray) -> np.ndarray:
 def _along_sticks(
     values: np.ndarray, seen: np.ndarray, gap: np.ndarray, near: np.ndarray, longest: int
 ) -> np.ndarray:
-    """Return values (m,) at voxels ``gap`` (3, m): between the nearest voxel with data, ``near`` (3, m), and
-    the first beyond.
+    """Values (m,) at voxels ``gap`` (3, m): between the nearest voxel with data, ``near`` (3, m), and the
+    first beyond.
 
     Weighted by distance, as in Vaughan, Lasso, Ungi, Fichtinger, Hole filling with oriented sticks in
     ultrasound volume reconstruction, J Med Imaging 2(3), 2015, doi 10.1117/1.JMI.2.3.034002; the stick points

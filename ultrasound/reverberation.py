@@ -107,7 +107,7 @@ class Reverberation:
 
     @ti.func
     def before(self, line, k):
-        """Return the impedance [MRayl] in front of the interface whose echo is at a sample."""
+        """The impedance [MRayl] in front of the interface whose echo is at a sample."""
         return self.sound.tissue[line, ti.cast(self.sound.echo[line, k].w, ti.i32)].x
 
     @ti.func
@@ -130,8 +130,8 @@ class Reverberation:
 
 
 def ringing(probe: Probe) -> np.ndarray:
-    """Return the amplitude of the array's own vibration at each sample, in air and in contact, (2,
-    samples) float32.
+    """The amplitude of the array's own vibration at each sample, in air and in contact, (2, samples)
+    float32.
     """
     depth = (np.arange(probe.number_of_samples_per_scanline) + 0.5) * probe.sample_mm / probe.wavelength_mm
     start = 10 ** (probe.ringing_db / 20)

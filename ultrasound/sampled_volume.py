@@ -56,8 +56,8 @@ class SampledVolume:
 
     @ti.func
     def cell_at(self, p):
-        """Return the first of the eight voxels around p [mm], the offsets to the next ones (0 to 1), and
-        whether p is inside.
+        """The first of the eight voxels around p [mm], the offsets to the next ones (0 to 1), and whether p
+        is inside.
         """
         at = self.linear @ p + self.offset
         last = tm.vec3(self.shape[0] - 1, self.shape[1] - 1, self.shape[2] - 1)
@@ -69,7 +69,7 @@ class SampledVolume:
 
     @ti.func
     def sample(self, p):
-        """Return the trilinear value at p [mm]."""
+        """The trilinear value at p [mm]."""
         first, t, inside = self.cell_at(p)
         value = self.voxels[0] * 0.0 + self.outside
         if inside:
@@ -81,7 +81,7 @@ class SampledVolume:
 
     @ti.func
     def sample_lanes(self, x, y, z, in_line):
-        """Return trilinear values at LANES points [mm]; ``in_line``: they are evenly spaced on a line."""
+        """Trilinear values at LANES points [mm]; ``in_line``: they are evenly spaced on a line."""
         a, o = self.linear, self.offset
         first_i, along_i, off_i = self.lanes_along(0, a[0, 0] * x + a[0, 1] * y + a[0, 2] * z + o[0])
         first_j, along_j, off_j = self.lanes_along(1, a[1, 0] * x + a[1, 1] * y + a[1, 2] * z + o[1])
@@ -110,7 +110,7 @@ class SampledVolume:
 
     @ti.func
     def between(self, voxel, tj, tk):
-        """Return values at lanes between the four voxels of a plane, of which this is the first."""
+        """Values at lanes between the four voxels of a plane, of which this is the first."""
         a, b = self.voxels[voxel], self.voxels[voxel + 1]
         c, d = self.voxels[voxel + self.next_y], self.voxels[voxel + self.next_y + 1]
         low, high = a + tk * (b - a), c + tk * (d - c)
@@ -126,17 +126,17 @@ class SampledVolume:
 
     @ti.func
     def lanes_of(self, at):
-        """Return the voxels of the lanes."""
+        """The voxels of the lanes."""
         return Lanes([self.voxels[at[lane]] for lane in ti.static(range(LANES))])
 
     @ti.func
     def along_z(self, voxel, t):
-        """Interpolate between a voxel and the next along z."""
+        """The value between a voxel and the next along z, at a fraction of their distance."""
         return tm.mix(self.voxels[voxel], self.voxels[voxel + 1], t)
 
     @ti.func
     def gradient(self, p):
-        """Return the gradient [1/mm] of the first trilinear value at p [mm], over a voxel to each side; zero
+        """The gradient [1/mm] of the first trilinear value at p [mm], over a voxel to each side; zero
         outside.
 
         The derivative of the trilinear value itself is constant along its axis in each cell: of a thin
@@ -156,8 +156,8 @@ class SampledVolume:
 
     @ti.func
     def slope(self, p):
-        """Return the gradient [1/mm] of the trilinear value at p [mm] of a volume of scalars, within its
-        cell; zero outside.
+        """The gradient [1/mm] of the trilinear value at p [mm] of a volume of scalars, within its cell; zero
+        outside.
         """
         first, t, inside = self.cell_at(p)
         along = tm.vec3(0.0)
@@ -177,7 +177,7 @@ class SampledVolume:
 
     @ti.func
     def first_value(self, at):
-        """Return the first trilinear value at an index within the grid."""
+        """The first trilinear value at an index within the grid."""
         most = ti.Vector([self.count[0] - 2, self.count[1] - 2, self.count[2] - 2])
         base = ti.min(ti.cast(at, ti.i32), most)
         t = at - base
@@ -193,8 +193,8 @@ class SampledVolume:
 def distance_volume(
     surface: trimesh.Trimesh, spacing_mm: float = 2.0, reach_mm: float = 6.0
 ) -> SampledVolume:
-    """Return signed distances [mm] to a closed surface, negative inside, up to ``reach_mm`` around it;
-    FAR_MM beyond.
+    """Signed distances [mm] to a closed surface, negative inside, up to ``reach_mm`` around it; FAR_MM
+    beyond.
     """
     distance, low = distance_grid(surface.vertices, surface.faces, spacing_mm, reach_mm)
     index_from_mm = np.eye(4)

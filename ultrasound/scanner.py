@@ -140,7 +140,7 @@ class Scanner:
         level_hu: float,
         shape: tuple[int, int] | None = None,
     ) -> PlaneImages:
-        """Return the images of a plane in a mode, of a shape (rows, columns).
+        """The images of a plane in a mode, of a shape (rows, columns).
 
         No row or column is beyond the scene's number of pixels, which is also the default.
         """
@@ -155,7 +155,7 @@ class Scanner:
     def doppler(
         self, images: PlaneImages, mode: DopplerMode, time_s: float = 0.0, clamped: bool = False
     ) -> np.ndarray:
-        """Return the B-mode image of the plane located last with Doppler over it, (rows, columns, 3) uint8.
+        """The B-mode image of the plane located last with Doppler over it, (rows, columns, 3) uint8.
 
         See ``Doppler.render``. Raises ValueError for images of another plane.
         """
@@ -167,7 +167,7 @@ class Scanner:
     def iq(
         self, images: PlaneImages, before: ImagePlane | None, wavefront: Wavefront, phase_reference: int
     ) -> IQSignal:
-        """Return IQ and RF signals of the B-mode image of the plane located last.
+        """IQ and RF signals of the B-mode image of the plane located last.
 
         ``before`` is the plane of the image before, ``wavefront`` the reference of phases, with its number.
         Raises ValueError for images of another plane.
@@ -185,8 +185,8 @@ class Scanner:
 
 
 def plane_section(vertices: np.ndarray, faces: np.ndarray, plane_from_world: np.ndarray) -> np.ndarray:
-    """Return the section of a closed surface (v, 3), (f, 3) [mm] with the plane w = 0: segments (n, 2, 2) of
-    (u, v) [mm].
+    """The section of a closed surface (v, 3), (f, 3) [mm] with the plane w = 0: segments (n, 2, 2) of (u, v)
+    [mm].
 
     ``plane_from_world`` (4, 4) is rigid: u to the marked side, v down into the tissue, w out of the plane.
     """

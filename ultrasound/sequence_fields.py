@@ -17,7 +17,7 @@ FrameFields = dict[int, dict[str, str]]
 def put_field(name: str, text: str, fields: dict[str, str], frames: FrameFields) -> None:
     """Put a field among those of the header, or of its frame by number.
 
-    Raises SweepError: twice, or a frame's without number.
+    Raises SweepError where it is there already, or a frame's has no number.
     """
     match = FRAME_FIELD.fullmatch(name)
     if name.startswith("Seq_Frame") and not match:
@@ -31,7 +31,7 @@ def put_field(name: str, text: str, fields: dict[str, str], frames: FrameFields)
 def numbers_of(name: str, text: str, expected: str) -> tuple[int, ...]:
     """The columns, rows and frames, or more numbers, in a text.
 
-    Raises SweepError: other than ``expected``, or too many pixels.
+    Raises SweepError where they are other than ``expected``, or too many pixels.
     """
     words = text.split()
     if len(words) != len(expected.split()) or not all(re.fullmatch("[0-9]{1,9}", word) for word in words):
@@ -50,7 +50,7 @@ def in_order(frames: FrameFields, count: int, name: str) -> list[dict[str, str]]
     last = max(frames, default=-1)
     if len(frames) != count or last != count - 1:
         raise SweepError(f"{name} has {count} frames, but {len(frames)} have fields, the last is {last}")
-    return [frames[each] for each in range(count)]
+    return [frames[number] for number in range(count)]
 
 
 def accept(name: str, text: str, accepted: Sequence[str]) -> str:

@@ -41,8 +41,8 @@ COMPONENTS, LEAST_WEIGHT = 8, 1e-3
 
 
 def noise_block() -> np.ndarray:
-    """Return periodic complex Gaussian noise (SIZE, SIZE, SIZE, 2) float32 of unit mean square, the same on
-    every machine.
+    """Periodic complex Gaussian noise (SIZE, SIZE, SIZE, 2) float32 of unit mean square, the same on every
+    machine.
 
     White noise convolved with a Gaussian of PITCHES entries SD: entries at a distance d correlate by exp(-d^2
     / (4 PITCHES^2)).
@@ -57,10 +57,10 @@ def noise_block() -> np.ndarray:
 
 
 def elevation_levels(sd_mm: np.ndarray) -> np.ndarray:
-    """Return, for correlation SDs (n,) [mm], index of the shorter length, its weight, that of the next one,
-    and the shorter length.
+    """For correlation SDs (n,) [mm], index of the shorter length, its weight, that of the next one, and the
+    shorter length: (n, 4) float32.
 
-    (n, 4) float32. The length is that of the nearest index, up to 9 % off.
+    The length is that of the nearest index, up to 9 % off.
     """
     at = np.clip(np.log(sd_mm / SHORTEST_SD_MM) / np.log(LENGTH_STEP), 0, LEVELS - 1.001)
     level = np.floor(at)
@@ -94,15 +94,15 @@ class Speckle:
 
     @ti.func
     def entry(self, i, j, k):
-        """Return the noise (2,), real and imaginary, at an entry of the block."""
+        """The noise (2,), real and imaginary, at an entry of the block."""
         size = ti.static(SIZE - 1)
         word = self.noise[((((i & size) << SIZE_BITS) | (j & size)) << SIZE_BITS) | (k & size)]
         return UNIT * tm.vec2((word << 16) >> 16, word >> 16)
 
     @ti.func
     def at(self, place, key):
-        """Return the noise (2,), of unit mean square, at a place in entries: interpolated along its last
-        axis, the long one.
+        """The noise (2,), of unit mean square, at a place in entries: interpolated along its last axis, the
+        long one.
         """
         at = place + CELL_OFFSET
         cell = ti.floor(at, ti.i32)
@@ -118,7 +118,7 @@ class Speckle:
 
     @ti.func
     def long_axis(self, across):
-        """Return the LongAxis for a vector across the image plane."""
+        """The LongAxis for a vector across the image plane."""
         size = ti.abs(across)
         face, x, y, top = 2, across.x, across.y, across.z
         if size.x > size.y and size.x > size.z:
@@ -133,21 +133,20 @@ class Speckle:
         return LongAxis(face, index, step, share)  # type: ignore[call-arg]
 
     @ti.func
-    def weight(self, each, axis, lengths):
-        """Return the weight of one of the COMPONENTS noises; ``lengths`` is of ``elevation_levels``."""
-        other = ti.Vector([(each >> 2) & 1, (each >> 1) & 1])
+    def weight(self, component, axis, lengths):
+        """The weight of one of the COMPONENTS noises; ``lengths`` is of ``elevation_levels``."""
+        other = ti.Vector([(component >> 2) & 1, (component >> 1) & 1])
         share = ti.select(other == 1, axis.share, 1.0 - axis.share)
-        return ti.sqrt(share.x * share.y) * ti.select((each & 1) == 1, lengths.z, lengths.y)
+        return ti.sqrt(share.x * share.y) * ti.select((component & 1) == 1, lengths.z, lengths.y)
 
     @ti.func
-    def component(self, each, axis, lengths, sd_mm, look):
-        """Return key and matrix (3, 3) from the rest position [mm] to entries of one of the COMPONENTS
-        noises.
+    def component(self, component, axis, lengths, sd_mm, look):
+        """Key and matrix (3, 3) from the rest position [mm] to entries of one of the COMPONENTS noises.
 
         ``sd_mm`` is the length along the image plane. Another ``look``, of an image steered by another angle,
         has other noise.
         """
-        other, longer = ti.Vector([(each >> 2) & 1, (each >> 1) & 1]), each & 1
+        other, longer = ti.Vector([(component >> 2) & 1, (component >> 1) & 1]), component & 1
         index = axis.index + other * axis.step
         level = ti.cast(lengths.x, ti.i32) + longer
         matrix = self.axes(axis.face, index)
@@ -162,7 +161,7 @@ class Speckle:
 
     @ti.func
     def axes(self, face, index):
-        """Return the rotation (3, 3) from rest axes to those of a direction, the long one last."""
+        """The rotation (3, 3) from rest axes to those of a direction, the long one last."""
         slope = ti.tan(ti.cast(index, ti.f32) * (2.0 * QUARTER / DIRECTIONS))
         long = tm.normalize(tm.vec3(slope.x, slope.y, 1.0))
         first = tm.normalize(tm.vec3(1.0, 0.0, -slope.x))

@@ -24,8 +24,8 @@ TRANSFORM_FIELD = re.compile(r"(\w+?To(?![a-z])\w+)Transform")
 CONFIGURATION_LIMIT = 1 << 22
 # Directions of increasing column and row: (un)marked side, far or near. U with F, and M with N, make a
 # left-handed image, whose third axis is descending in IGSIO; a third letter has no effect on a single slice.
-ORIENTATIONS = {each: each for each in ("MF", "MN", "UF", "UN", "FM", "NM", "FU", "NU")}
-ORIENTATIONS |= {f"{each}A": each for each in ORIENTATIONS} | {"UFD": "UF", "MND": "MN"}
+ORIENTATIONS = {orientation: orientation for orientation in ("MF", "MN", "UF", "UN", "FM", "NM", "FU", "NU")}
+ORIENTATIONS |= {f"{orientation}A": orientation for orientation in ORIENTATIONS} | {"UFD": "UF", "MND": "MN"}
 
 
 class PixelLabel(IntEnum):
@@ -70,7 +70,9 @@ class Sweep:
 
     @property
     def times_s(self) -> np.ndarray:
-        """Time of each frame (n,) [s]; SweepError where a timestamp is missing or not a finite number."""
+        """Time of each frame (n,) [s]. Raises SweepError where a timestamp is missing or not a finite
+        number.
+        """
         times = np.full(len(self), np.nan)
         for frame, fields in enumerate(self.frames):
             text = fields.get("Timestamp", "")
@@ -83,8 +85,8 @@ class Sweep:
         return times
 
     def transform(self, start: str, end: str, frame: int) -> np.ndarray | None:
-        """Return the matrix (4, 4) from ``start`` to ``end``, such as "Image" and "Reference", along the
-        shortest chain of transforms.
+        """The matrix (4, 4) from ``start`` to ``end``, such as "Image" and "Reference", along the shortest
+        chain of transforms.
 
         None where a transform of the chain was not tracked (status not OK). Raises SweepError where no chain
         joins the two, or where one of its transforms is not an affine matrix.
@@ -120,8 +122,8 @@ class Sweep:
 
 
 def shortest_chain(names: Iterable[str], start: str, end: str) -> list[tuple[str, bool]] | None:
-    """Return the transforms from ``start`` to ``end``, each with whether to invert it; None where no chain
-    joins them.
+    """The transforms from ``start`` to ``end``, each with whether to invert it; None where no chain joins
+    them.
     """
     steps: dict[str, list[tuple[str, str, bool]]] = {}
     for name in names:
@@ -141,7 +143,7 @@ def shortest_chain(names: Iterable[str], start: str, end: str) -> list[tuple[str
 
 
 def reoriented(images: np.ndarray, orientation: str) -> np.ndarray:
-    """Return images (n, rows, columns) of one of the ORIENTATIONS in MF."""
+    """Images (n, rows, columns) of one of the ORIENTATIONS in MF."""
     column, row = tuple(ORIENTATIONS[orientation])
     if column in "FN":
         images, column, row = images.transpose(0, 2, 1), row, column
@@ -149,8 +151,7 @@ def reoriented(images: np.ndarray, orientation: str) -> np.ndarray:
 
 
 def load_constants(path: Path) -> dict[str, np.ndarray]:
-    """Return the transforms (4, 4) of a PLUS configuration's CoordinateDefinitions, by name: {"ImageToProbe":
-    ...}.
+    """The transforms (4, 4) of a PLUS configuration's CoordinateDefinitions, by name: {"ImageToProbe": ...}.
 
     Raises SweepError for a file that cannot be read, has no transform, or an invalid one.
     """
@@ -160,38 +161,36 @@ def load_constants(path: Path) -> dict[str, np.ndarray]:
             content = file.read(CONFIGURATION_LIMIT + 1)
         if len(content) > CONFIGURATION_LIMIT:
             raise SweepError(f"more than {CONFIGURATION_LIMIT >> 20} MB")
-        for each in ElementTree.fromstring(content).iterfind("CoordinateDefinitions/Transform"):
-            name = f"{each.get('From', '')}To{each.get('To', '')}"
+        for element in ElementTree.fromstring(content).iterfind("CoordinateDefinitions/Transform"):
+            name = f"{element.get('From', '')}To{element.get('To', '')}"
             if not TRANSFORM_NAME.fullmatch(name) or name in constants:
                 raise SweepError(
                     f"Transform {reprlib.repr(name)}: expected From and To, each pair once, To with a capital"
                 )
-            constants[name] = matrix_of(each.get("Matrix", ""), f"{name} Matrix")
+            constants[name] = matrix_of(element.get("Matrix", ""), f"{name} Matrix")
         if not constants:
             raise SweepError("no CoordinateDefinitions with a Transform")
     except (OSError, SweepError, ElementTree.ParseError, LookupError, ValueError) as error:
-        found = error.strerror if isinstance(error, OSError) else str(error)
+        reason = error.strerror if isinstance(error, OSError) else str(error)
         if not isinstance(error, (OSError, SweepError)):
-            found = f"no XML: {found}"
+            reason = f"no XML: {reason}"
         raise SweepError(
-            f"{path.name}: {found}; expected a PLUS configuration (XML); a scene or a patient's folder goes "
+            f"{path.name}: {reason}; expected a PLUS configuration (XML); a scene or a patient's folder goes "
             "after --scene"
         ) from error
     return constants
 
 
 def transform_fields(name: str, matrix: np.ndarray | None) -> dict[str, str]:
-    """Return the fields of a frame for a transform, such as "ProbeToReference"; None is one that was not
-    tracked.
-    """
+    """The fields of a frame for a transform, such as "ProbeToReference"; None is one that was not tracked."""
     status = "INVALID" if matrix is None else "OK"
     text = transform_text(np.eye(4) if matrix is None else matrix)
     return {f"{name}Transform": text, f"{name}TransformStatus": status}
 
 
 def transform_text(matrix: np.ndarray) -> str:
-    """Return sixteen numbers row by row that read back to the same float64; SweepError for what is not an
-    affine matrix (4, 4).
+    """Sixteen numbers row by row that read back to the same float64. Raises SweepError where the matrix is
+    not affine (4, 4).
     """
     affine = _affine(np.asarray(matrix, float), "a transform", reprlib.repr(np.asarray(matrix).tolist()))
     # Adding 0 removes the sign of a negative zero.
@@ -199,9 +198,7 @@ def transform_text(matrix: np.ndarray) -> str:
 
 
 def matrix_of(text: str, what: str) -> np.ndarray:
-    """Return the affine matrix (4, 4) of sixteen numbers row by row; else raise SweepError, which names
-    ``what``.
-    """
+    """The affine matrix (4, 4) of sixteen numbers row by row. Raises SweepError, which names ``what``."""
     try:
         numbers = np.array(text.split(), float)
     except ValueError:
@@ -209,11 +206,9 @@ def matrix_of(text: str, what: str) -> np.ndarray:
     return _affine(numbers.reshape(4, 4) if numbers.size == 16 else numbers, what, reprlib.repr(text))
 
 
-def _affine(matrix: np.ndarray, what: str, found: str) -> np.ndarray:
+def _affine(matrix: np.ndarray, what: str, text: str) -> np.ndarray:
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or (matrix[3] != [0, 0, 0, 1]).any():
-        raise SweepError(
-            f"{what} = {found}: expected sixteen finite numbers row by row, the last row 0 0 0 1"
-        )
+        raise SweepError(f"{what} = {text}: expected sixteen finite numbers row by row, the last row 0 0 0 1")
     return matrix
 
 

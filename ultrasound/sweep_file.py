@@ -79,8 +79,8 @@ PROBE_FIELD, VERSION_FIELD = "TransducerName", "NephronVersion"
 
 
 def read_sweep(path: Path) -> Sweep:
-    """Return a sequence file's images, in MF, and fields, with the names of a metafile. Times and transforms
-    are parsed on demand.
+    """A sequence file's images, in MF, and fields, with the names of a metafile. Times and transforms are
+    parsed on demand.
 
     Raises SweepError with the file's name for a file that cannot be read, is damaged, or is not an 8-bit
     B-mode sweep.
@@ -105,7 +105,7 @@ def write_sweep(path: Path, sweep: Sweep) -> None:
 
 
 def read_ground_truth(sweep: Path) -> Sweep | None:
-    """Return the labels recorded with a sweep, None where there are none. Raises SweepError."""
+    """The labels recorded with a sweep, None where there are none. Raises SweepError."""
     suffix = suffix_of(sweep)
     path = sweep.with_name(sweep.name.removesuffix(suffix) + LABELS_SUFFIX.removesuffix(SUFFIX) + suffix)
     return read_sweep(path) if sweep.name.endswith(suffix) and path.is_file() else None
@@ -150,8 +150,8 @@ class SweepWriter:
         this frame.
         """
         if image.dtype != np.uint8 or image.ndim != 2 or image.shape != (self._shape or image.shape):
-            found, expected = f"{image.dtype} {image.shape}", self._shape or "(rows, columns)"
-            raise SweepError(f"frame {self.count}: image of {found}: expected uint8 {expected}")
+            actual, expected = f"{image.dtype} {image.shape}", self._shape or "(rows, columns)"
+            raise SweepError(f"frame {self.count}: image of {actual}: expected uint8 {expected}")
         if (self.count + 1) * image.size > PIXEL_LIMIT:
             raise SweepError(f"frame {self.count}: more than {PIXEL_LIMIT} bytes of pixels")
         lines = (nrrd_frame_lines if self._is_nrrd else _frame_lines)(self.count, fields)
@@ -284,7 +284,7 @@ def _read(file: BinaryIO) -> Sweep:
 
 
 def _read_header(file: BinaryIO) -> tuple[dict[str, str], FrameFields]:
-    """Return the fields of the header and of each frame by number; leave the file at the pixels."""
+    """The fields of the header and of each frame by number; leave the file at the pixels."""
     fields: dict[str, str] = {}
     frames: FrameFields = {}
     if b"".join(file.readline(HEADER_LIMIT).split()) != b"ObjectType=Image":
@@ -310,20 +310,20 @@ def _read_header(file: BinaryIO) -> tuple[dict[str, str], FrameFields]:
 
 
 def _read_pixels(file: BinaryIO, fields: dict[str, str], size: int) -> bytes:
-    found = os.fstat(file.fileno()).st_size - file.tell()
+    remaining = os.fstat(file.fileno()).st_size - file.tell()
     if fields.get("CompressedData", "").strip() != "True":
-        if found != size:
-            raise SweepError(f"{found} bytes of pixels: expected {size}")
+        if remaining != size:
+            raise SweepError(f"{remaining} bytes of pixels: expected {size}")
         return file.read(size)
     text = fields.get("CompressedDataSize", "")
     # Deflate adds at most five bytes in some thousands.
-    if text.strip() != str(found) or found > size + size // 1000 + 1024:
+    if text.strip() != str(remaining) or remaining > size + size // 1000 + 1024:
         raise SweepError(
-            f"CompressedDataSize = {reprlib.repr(text)}, but {found} bytes were found for {size}"
+            f"CompressedDataSize = {reprlib.repr(text)}, but {remaining} bytes were found for {size}"
         )
     decoder = zlib.decompressobj()
     try:
-        pixels = decoder.decompress(file.read(found), size + 1)
+        pixels = decoder.decompress(file.read(remaining), size + 1)
     except zlib.error as error:
         raise SweepError(f"the pixels are not zlib data: {error}") from error
     if len(pixels) != size or not decoder.eof or decoder.unused_data:

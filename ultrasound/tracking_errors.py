@@ -27,8 +27,7 @@ class TrackingErrors:
 def with_tracking_errors(
     poses: np.ndarray, times_s: np.ndarray, errors: TrackingErrors, seed: int = 0
 ) -> list[np.ndarray | None]:
-    """Return rigid ``poses`` (n, 4, 4) [mm], reference from probe, as a tracker reports them: None where
-    lost.
+    """Rigid ``poses`` (n, 4, 4) [mm], reference from probe, as a tracker reports them: None where lost.
 
     In this order: latency; noise, with rotation about the probe's origin; calibration, on the image's side
     (``pose @ calibration``). A ``seed`` draws the same pattern at every size of the errors, so that sizes can
@@ -44,7 +43,7 @@ def with_tracking_errors(
 
 
 def _delayed(poses: np.ndarray, times: np.ndarray, latency_s: float) -> np.ndarray:
-    """Return the poses of ``latency_s`` earlier; before the first, the first."""
+    """The poses of ``latency_s`` earlier; before the first, the first."""
     if latency_s == 0 or len(poses) < 2:
         return poses
     earlier = np.maximum(times - latency_s, times[0])
@@ -61,7 +60,7 @@ def _noisy(poses: np.ndarray, errors: TrackingErrors, draw: np.random.Generator)
 
 
 def _calibration(errors: TrackingErrors, draw: np.random.Generator) -> np.ndarray:
-    """Return the calibration error (4, 4): from the assumed image position to the true one."""
+    """The calibration error (4, 4): from the assumed image position to the true one."""
     direction, axis = (v / np.linalg.norm(v) for v in draw.standard_normal((2, 3)))
     turn = Rotation.from_rotvec(np.radians(errors.calibration_deg) * axis)
     return rigid(turn.as_matrix(), errors.calibration_mm * direction)

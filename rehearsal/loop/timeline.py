@@ -361,7 +361,7 @@ def _shapes_of(state: WholeState) -> list[tuple]:
     return [
         (name, values.shape, values.dtype.str)
         for solver in solvers
-        for name, values in [("", solver.body.position), *sorted(solver.history.items())]
+        for name, values in [("", solver.body.position), *sorted(solver.internal_state.items())]
     ]
 
 

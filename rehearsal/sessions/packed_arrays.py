@@ -225,7 +225,7 @@ def _pose(arrays: dict[str, np.ndarray], name: str) -> np.ndarray:
 
 
 def _of_solver(name: str, state: SolverState) -> dict[str, np.ndarray]:
-    contacts = {f"{name}.contacts.{key}": values for key, values in state.history.items()}
+    contacts = {f"{name}.contacts.{key}": values for key, values in state.internal_state.items()}
     return {f"{name}.position": state.body.position, f"{name}.velocity": state.body.velocity} | contacts
 
 
@@ -235,5 +235,7 @@ def _solver(arrays: dict[str, np.ndarray], name: str, positions: np.ndarray) -> 
         if values.shape != positions.shape or values.dtype != np.float32 or not np.isfinite(values).all():
             raise StateError(f"{values.dtype} {values.shape}: expected finite float32 {positions.shape}")
     begin = f"{name}.contacts."
-    history = {key.removeprefix(begin): values for key, values in arrays.items() if key.startswith(begin)}
-    return SolverState(BodyState(*body), history)
+    internal_state = {
+        key.removeprefix(begin): values for key, values in arrays.items() if key.startswith(begin)
+    }
+    return SolverState(BodyState(*body), internal_state)

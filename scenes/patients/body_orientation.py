@@ -40,24 +40,24 @@ def orientation_warnings(
 ) -> tuple[str, ...]:
     """A warning for each organ that is not where it is in a body.
 
-    Args:
-        overview: the CT [HU] in its full width at the level of the organ.
-        labels: may have a liver.
-        midline: LPS x [mm]; None where the CT does not show it.
-        organ_z_mm: LPS z of the organ's middle.
+    ``overview`` is the CT [HU] in its full width at the level of the organ; ``labels`` may have a liver.
+    ``midline`` is LPS x [mm], None where the CT does not show it; ``organ_z_mm`` is LPS z of the organ's
+    middle.
     """
-    found = []
+    warnings = []
     if _bones_ahead(overview):
-        found.append("the bones are in front of the body's centre, not behind it; the CT may be turned over")
+        warnings.append(
+            "the bones are in front of the body's centre, not behind it; the CT may be turned over"
+        )
     grid, mean = _cells(overview)
     liver = None if midline is None else _liver(grid, mean, labels, midline)
     if liver is not None and midline is not None and liver[0] > midline + LIVER_LEFT_MM:
-        found.append("the liver is on the patient's left; CT and labels may be mirrored")
+        warnings.append("the liver is on the patient's left; CT and labels may be mirrored")
     below = {"lungs": _lungs_z(grid, mean), "liver": None if liver is None else liver[2]}
     names = [name for name, z in below.items() if z is not None and z < organ_z_mm - LEAST_BELOW_MM]
     if names:
-        found.append(f"{' and '.join(names)} are below the kidney's middle; the CT may be upside down")
-    return tuple(f"{line}; compare check.png with the patient" for line in found)
+        warnings.append(f"{' and '.join(names)} are below the kidney's middle; the CT may be upside down")
+    return tuple(f"{line}; compare check.png with the patient" for line in warnings)
 
 
 def _bones_ahead(overview: sitk.Image) -> bool:

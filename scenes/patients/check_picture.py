@@ -239,7 +239,7 @@ def resample_plane(
 def is_wider(overview: sitk.Image, ct: sitk.Image) -> bool:
     """Whether the overview shows more of the body's width than the cropped CT."""
     width_mm, shown_mm = (
-        np.ptp([corner[0] for corner in VoxelGrid.of(each).bounds()]) for each in (overview, ct)
+        np.ptp([corner[0] for corner in VoxelGrid.of(image).bounds()]) for image in (overview, ct)
     )
     return bool(width_mm > LEAST_WIDER * shown_mm)
 

@@ -37,30 +37,25 @@ def corrections_of(
     organ: trimesh.Trimesh,
     classes: Sequence[LabelMap],
 ) -> tuple[sitk.Image | None, list[str]]:
-    """Return codes of TISSUES where class images correct the classification, 0 elsewhere, uint8 on its fine
-    grid, and notes.
+    """Codes of TISSUES where class images correct the classification, 0 elsewhere, uint8 on its fine grid, or
+    None where they correct nothing; and notes.
 
-    None where they correct nothing.
-
-    Args:
-        grid: of ``hounsfield`` [HU] and ``coded`` (z, y, x), the tissue codes by labels; 0 without.
-        tissues: of the codes.
-        organ: its surface [mm].
-        classes: of class images, on any grid.
+    ``hounsfield`` [HU] and ``coded`` (z, y, x), the codes of the labelled ``tissues`` or 0, are on ``grid``.
+    ``organ`` is a surface [mm]; ``classes`` are the label maps of class images, on any grid.
     """
     own = codes_of_labels(coded.transpose(2, 1, 0), tissues)
     hu = np.ascontiguousarray(hounsfield.transpose(2, 1, 0), np.float32)
-    found = tissue_map(hu, own, organ, grid.index_from_mm, draws=False)
-    fine = VoxelGrid.of_transform(found.index_from_mm, found.codes.shape)
-    stated = _stated(classes, fine, found.codes)
-    changed = (stated > 0) & (stated != found.codes)
+    classification = tissue_map(hu, own, organ, grid.index_from_mm, draws=False)
+    fine = VoxelGrid.of_transform(classification.index_from_mm, classification.codes.shape)
+    stated = _stated(classes, fine, classification.codes)
+    changed = (stated > 0) & (stated != classification.codes)
     for axis, factor in enumerate(fine_factors(grid.spacing)):
         own = own.repeat(factor, axis)
-    taken = changed & _may_be(stated, own, found.codes)
+    taken = changed & _may_be(stated, own, classification.codes)
     texts = {
-        "corrected by the class image": _changes(found.codes, stated, taken, fine),
+        "corrected by the class image": _changes(classification.codes, stated, taken, fine),
         "not taken from the class image, as the labels say where kidney, tumours, cysts and other "
-        "labelled tissues are": (_changes(found.codes, stated, changed & ~taken, fine)),
+        "labelled tissues are": (_changes(classification.codes, stated, changed & ~taken, fine)),
         "left out of the class image, as drawn from an atlas": _drawn(classes),
     }
     notes = [f"{text}: {listed(names)}" for text, names in texts.items() if names]
@@ -69,46 +64,44 @@ def corrections_of(
     return fine.image(np.ascontiguousarray(np.where(taken, stated, 0).transpose(2, 1, 0), np.uint8)), notes
 
 
-def _stated(classes: Sequence[LabelMap], fine: VoxelGrid, found: np.ndarray) -> np.ndarray:
-    """Return what class images say (nx, ny, nz), as codes of TISSUES; 0 where they say nothing.
+def _stated(classes: Sequence[LabelMap], fine: VoxelGrid, classified: np.ndarray) -> np.ndarray:
+    """What class images say (nx, ny, nz), as codes of TISSUES; 0 where they say nothing.
 
-    Where several layers of a file say something, what differs from ``found`` counts. Sheets are of the tissue
-    that they were drawn in.
+    Where several layers of a file say something, what differs from ``classified`` counts. Sheets are of the
+    tissue that they were drawn in.
     """
-    stated, sheets = np.zeros(found.shape, np.uint8), np.zeros(found.shape, bool)
+    stated, sheets = np.zeros(classified.shape, np.uint8), np.zeros(classified.shape, bool)
     for one in classes:
         known = {v: s.tissue for v, s in one.segments.items() if s.tissue and not is_drawn(s.name)}
         values = resample_nearest(one.grid, one.values, fine).transpose(2, 1, 0)
         sheets |= np.isin(values, [v for v, s in one.segments.items() if s.name in DRAWN_SHEETS])
         codes = codes_of_labels(values, known)
-        counts = (codes > 0) & ((stated == 0) | (codes != found))
+        counts = (codes > 0) & ((stated == 0) | (codes != classified))
         stated[counts] = codes[counts]
-    for tissue in np.unique(found[sheets & (stated == 0)]):
-        of_tissue = (stated > 0) & (found == tissue)
+    for tissue in np.unique(classified[sheets & (stated == 0)]):
+        of_tissue = (stated > 0) & (classified == tissue)
         if (stated[of_tissue] != tissue).any():
             nearest = ndimage.distance_transform_edt(~of_tissue, fine.spacing, False, True)
-            lines = sheets & (stated == 0) & (found == tissue)
+            lines = sheets & (stated == 0) & (classified == tissue)
             stated[lines] = stated[tuple(nearest[:, lines])]
     return stated
 
 
-def _may_be(stated: np.ndarray, own: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Return whether what a class image says counts, where the labels say ``own``: the kidney's surface
-    leaves out some of its voxels.
+def _may_be(stated: np.ndarray, own: np.ndarray, classified: np.ndarray) -> np.ndarray:
+    """Whether what a class image says counts, where the labels say ``own``: the kidney's surface leaves out
+    some of its voxels.
     """
     kidney = own == CODE["kidney"]
-    within = kidney & of_tissues(found, "kidney", *PARTS_OF_KIDNEY)
+    within = kidney & of_tissues(classified, "kidney", *PARTS_OF_KIDNEY)
     beside = ((own == 0) | kidney) & ~within
     return (within & of_tissues(stated, *PARTS_OF_KIDNEY)) | (
         beside & ~of_tissues(stated, *OF_LABELS, *WITHIN_KIDNEY)
     )
 
 
-def _changes(found: np.ndarray, stated: np.ndarray, where: np.ndarray, grid: VoxelGrid) -> list[str]:
-    """Return in words what was found to be one tissue and is said to be another, the largest volumes
-    first.
-    """
-    ml = np.bincount(256 * found[where].astype(int) + stated[where], minlength=1) * grid.voxel_ml
+def _changes(classified: np.ndarray, stated: np.ndarray, where: np.ndarray, grid: VoxelGrid) -> list[str]:
+    """What class images change, from tissue to tissue in words, the largest volumes first."""
+    ml = np.bincount(256 * classified[where].astype(int) + stated[where], minlength=1) * grid.voxel_ml
     largest = [int(n) for n in np.argsort(ml)[::-1] if ml[n] >= LEAST_ML]
     return [f"{TISSUES[n // 256 - 1]} is {TISSUES[n % 256 - 1]} ({ml[n]:.1f} ml)" for n in largest]
 

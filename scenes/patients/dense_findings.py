@@ -31,14 +31,11 @@ def dense_findings(
     organ: trimesh.Trimesh,
     corrections: sitk.Image | None = None,
 ) -> tuple[tuple[str, ...], str]:
-    """Return warnings of the dense pieces of a kidney, which say how they are shown, and a note of its
-    contrast phase.
+    """Warnings of the dense pieces of a kidney, which say how they are shown, and a note of its contrast
+    phase.
 
-    Args:
-        grid: of ``hounsfield`` [HU] and ``coded`` (z, y, x), the tissue codes by labels; 0 without.
-        tissues: of the codes.
-        organ: its surface [mm].
-        corrections: of tissues, by a class image, 0 without.
+    ``hounsfield`` [HU] and ``coded`` (z, y, x), the codes of the labelled ``tissues`` or 0, are on ``grid``.
+    ``organ`` is a surface [mm]; ``corrections`` are the tissues that class images correct, 0 elsewhere.
     """
     own = codes_of_labels(coded.transpose(2, 1, 0), tissues)
     hu = np.ascontiguousarray(hounsfield.transpose(2, 1, 0), np.float32)
@@ -47,15 +44,15 @@ def dense_findings(
     is_enhanced, warnings = level_hu > ENHANCED_FROM_HU, list[str]()
     agent_ml = 0.0
     if _has_dense(hu, parenchyma | of_tissues(own, "sinus"), level_hu + DENSE_ABOVE_HU, grid.spacing):
-        found, index_from_mm = dense_pieces_of_kidney(hu, own, organ, grid.index_from_mm)
-        fine = VoxelGrid.of_transform(index_from_mm, found.urine.shape)
-        corrected = np.zeros(found.urine.shape, bool)
+        pieces, index_from_mm = dense_pieces_of_kidney(hu, own, organ, grid.index_from_mm)
+        fine = VoxelGrid.of_transform(index_from_mm, pieces.urine.shape)
+        corrected = np.zeros(pieces.urine.shape, bool)
         if corrections is not None:
             corrected = _sampled(corrections, fine)
         labelled = _sampled(grid.image((own == CODE["urine"]).transpose(2, 1, 0).astype(np.uint8)), fine)
-        urine = _without_touching(found.urine, labelled) & ~corrected
-        stone = found.stone & ~corrected
-        is_enhanced, agent_ml = found.is_enhanced, float(urine.sum() * fine.voxel_ml)
+        urine = _without_touching(pieces.urine, labelled) & ~corrected
+        stone = pieces.stone & ~corrected
+        is_enhanced, agent_ml = pieces.is_enhanced, float(urine.sum() * fine.voxel_ml)
         kidney = f"kidney {level_hu:.0f} HU: {'enhanced' if is_enhanced else 'unenhanced'}"
         agent = (
             "contrast agent in the collecting system",
@@ -81,8 +78,8 @@ def dense_findings(
 
 
 def _has_dense(hu: np.ndarray, kidney: np.ndarray, above_hu: float, spacing_mm: np.ndarray) -> bool:
-    """Return whether there is anything dense in a kidney (nx, ny, nz) and its hollows, or next to them:
-    few have any.
+    """Whether there is anything dense in a kidney (nx, ny, nz) and its hollows, or next to them: few have
+    any.
     """
     if not kidney.any():
         return False
@@ -97,13 +94,13 @@ def _has_dense(hu: np.ndarray, kidney: np.ndarray, above_hu: float, spacing_mm: 
 
 
 def _sampled(image: sitk.Image, grid: VoxelGrid) -> np.ndarray:
-    """Return whether an image's voxel is not 0 at those of another grid (nx, ny, nz)."""
+    """Whether an image's voxel is not 0 at those of another grid (nx, ny, nz)."""
     return grid.sampled(image, sitk.sitkNearestNeighbor, 0).transpose(2, 1, 0) > 0
 
 
 def _without_touching(mask: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the pieces of a mask that do not touch another: the rim of labelled contrast agent is as
-    bright by partial volume.
+    """The pieces of a mask that do not touch another: the rim of labelled contrast agent is as bright by
+    partial volume.
     """
     pieces, _ = ndimage.label(mask, np.ones((3, 3, 3)))
     touching = np.unique(pieces[ndimage.binary_dilation(other, np.ones((3, 3, 3)))])
@@ -111,7 +108,7 @@ def _without_touching(mask: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _largest_piece(grid: VoxelGrid, mask: np.ndarray, organ: trimesh.Trimesh) -> str:
-    """Return in words where the largest connected piece of a mask (nx, ny, nz) is."""
+    """Where the largest connected piece of a mask (nx, ny, nz) is, in words."""
     pieces, _ = ndimage.label(mask, np.ones((3, 3, 3)))
     piece = pieces == np.bincount(pieces[mask]).argmax()
     x, y, z = grid.place(np.argwhere(piece)).mean(axis=0)

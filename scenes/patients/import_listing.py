@@ -28,7 +28,7 @@ def listing_text(
     """CT series and labels as tables: without any name, ID or date of the patient, but with the names of
     files and labels.
 
-    Raises PatientError: a path that cannot be read.
+    Raises PatientError where a path cannot be read.
     """
     listed = list_ct(ct, progress, space)
     faults = [f"series {_name(row)} cannot be imported: {row.fault}" for row in listed.series if row.fault]

@@ -52,20 +52,14 @@ def import_request(
     progress: Progress = silent,
     space: Space | None = None,
 ) -> Patient:
-    """The imported patient.
+    """The patient that a user imports from the paths ``ct`` and ``labels``, or from a seed instead of labels.
 
-    Args:
-        ct, labels: paths of the user.
-        organ: names or values of its labels.
-        tissues: tissue -> names or values of its labels.
-        side, support, position: as in ``import_patient``.
-        series: number or UID of one of several series.
-        seed_mm: (3,) LPS; instead of labels.
-        progress: shows the progress of each step.
-        space: of the axes of files that do not name it.
+    ``organ`` has names or values of the organ's labels, ``tissues`` those of each tissue's. ``side``,
+    ``support`` and ``position`` are as in ``import_patient``. ``series`` is the number or UID of one of
+    several series; ``seed_mm`` (3,) is in LPS; ``space`` is that of the axes of files that do not name it.
+    ``progress`` shows the progress of each step.
 
-    Raises:
-        PatientError: what was found, what was expected and what to do.
+    Raises PatientError, which names what was found, what was expected and what to do.
     """
     if not ct.exists():
         raise PatientError(f"{ct}: no such file or folder; check the path")
@@ -74,9 +68,9 @@ def import_request(
         contents = None if ct.is_file() and is_volume_file(ct) else read_dicom_headers(ct, progress)
         words = [*organ, *chain(*tissues.values())]
         segmentations = _segmentations(ct, contents, labels, series, words, progress, space)
-        assumed = any(each.space for each in segmentations)
-        of_classes = [each for each in segmentations if each.is_class_image]
-        segmentations = [each for each in segmentations if not each.is_class_image]
+        assumed = any(segmentation.space for segmentation in segmentations)
+        of_classes = [segmentation for segmentation in segmentations if segmentation.is_class_image]
+        segmentations = [segmentation for segmentation in segmentations if not segmentation.is_class_image]
         if not segmentations:
             raise PatientError(
                 "the labels are a class image alone, which corrects tissues and has no organ; give the "
@@ -84,7 +78,7 @@ def import_request(
             )
         volume = volume_of_labels(ct, segmentations, series, progress, contents, space)
         of_organ = organ_labels(segmentations, volume, organ, tissues)
-        classes = [one for each in of_classes for one in each.maps(volume.grid)]
+        classes = [one for segmentation in of_classes for one in segmentation.maps(volume.grid)]
         assumed = assumed or volume.space is not None
     elif labels or organ or tissues:
         raise PatientError(
@@ -105,7 +99,7 @@ def import_request(
         of_organ.own,
         side,
         support=support,
-        given=tissues,
+        assigned=tissues,
         drawn=of_organ.drawn,
         position=position,
         progress=progress,
@@ -177,13 +171,13 @@ def _segmentations(
 
     if labels:
         return [open_labels(path, words, progress, belongs, space) for path in labels]
-    found = segmentation_of(contents, words, progress, belongs) if contents else None
-    if found is None:
+    segmentation = segmentation_of(contents, words, progress, belongs) if contents else None
+    if segmentation is None:
         raise PatientError(
             f"{ct}: no labels are with this CT; give a file or folder with LABELS, or --seed X,Y,Z for a "
             "draft"
         )
-    return [found]
+    return [segmentation]
 
 
 def volume_of_labels(
@@ -206,5 +200,5 @@ def volume_of_labels(
                 "it with --series, or give "
                 "its folder"
             )
-    found = [note for s in segmentations for note in doubts(s.references, volume.references)]
-    return replace(volume, notes=(*volume.notes, *dict.fromkeys(found)))
+    notes = [note for s in segmentations for note in doubts(s.references, volume.references)]
+    return replace(volume, notes=(*volume.notes, *dict.fromkeys(notes)))

@@ -52,17 +52,14 @@ def label_warnings(
     """Warnings of labels without a known tissue: taken as the organ, or left out though they are in it or
     touch it.
 
-    Args:
-        labels: of the organ.
-        piece: the organ.
-        is_named: whether the user named its labels.
-        drawn: the label maps before they were merged.
+    ``piece`` is the organ in ``labels``, ``drawn`` the label maps before they were merged; ``is_named``:
+    whether the user named the organ's labels.
     """
-    found = []
+    warnings = []
     unnamed = [value for value in piece.present if not labels.segments[value].name]
     if not is_named and len(unnamed) > 1:
         names = listed([str(labels.segments[value]) for value in unnamed])
-        found.append(
+        warnings.append(
             f"labels {names} have no names, and were all taken as the kidney; if they are not, give --organ, "
             "--tumour, --cyst"
         )
@@ -72,8 +69,8 @@ def label_warnings(
     for one in drawn:
         for value, segment in one.segments.items():
             if segment not in taken and segment.tissue not in OF_KIDNEY and not is_derived(segment.name):
-                found += _other_segment(one, value, piece, near)
-    return tuple(found)
+                warnings += _other_segment(one, value, piece, near)
+    return tuple(warnings)
 
 
 def _other_segment(one: LabelMap, value: int, piece: Organ, near: np.ndarray) -> list[str]:

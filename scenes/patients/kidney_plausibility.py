@@ -38,12 +38,9 @@ def kidney_warnings(
 ) -> tuple[str, ...]:
     """Warnings of an organ that is unlike one whole kidney.
 
-    Args:
-        piece: the organ.
-        labels: its tumours and cysts are recognised by their tissue.
-        surface: the organ's, LPS [mm], closed.
-        side: of the body.
-        midline: LPS x [mm]; None where the CT does not show it.
+    ``piece`` is the organ, ``surface`` its closed surface, LPS [mm], and ``side`` that of the body. Tumours
+    and cysts in ``labels`` are recognised by their tissue. ``midline`` is LPS x [mm], None where the CT does
+    not show it.
     """
     healthy = piece.mask & ~np.isin(piece.values, labels.of_tissues(*LESIONS))
     return (

@@ -64,10 +64,10 @@ def best_shift(grid: VoxelGrid, hounsfield: np.ndarray, label: VoxelGrid, organ:
 
 def _lattice(grid: VoxelGrid, label: VoxelGrid) -> VoxelGrid:
     """A grid of LATTICE_MM along the CT's axes, in the CT, around the label."""
-    found = grid.index(label.corners())
+    indices = grid.index(label.corners())
     reach = (STEPS + 1) * LATTICE_MM / grid.spacing
     last = np.array(grid.size) - 1
-    low, high = np.clip([found.min(axis=0) - reach, found.max(axis=0) + reach], 0, last)
+    low, high = np.clip([indices.min(axis=0) - reach, indices.max(axis=0) + reach], 0, last)
     size = np.maximum((high - low) * grid.spacing // LATTICE_MM, 1).astype(int) + 1
     return replace(grid, size=tuple(size.tolist()), spacing=np.full(3, LATTICE_MM), origin=grid.place(low))
 

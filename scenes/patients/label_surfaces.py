@@ -24,19 +24,13 @@ TERRACE_SD = 0.7
 
 
 def surface_from_mask(mask: sitk.Image, faces: int = FACES) -> trimesh.Trimesh:
-    """Closed surface of the largest body in a label.
+    """The closed surface of the largest body in a label: a watertight mesh, normals outward, vertices (n, 3)
+    in LPS [mm].
 
-    The surface encloses the volume of that body (internal holes counted as tissue) to about 0.01 %.
-
-    Args:
-        mask: 3D image, non-zero inside the body; any spacing [mm], origin and direction.
-        faces: number of triangles, met within a few.
-
-    Returns:
-        Watertight mesh of one body, normals outward; vertices in LPS [mm], shape (vertex_count, 3).
-
-    Raises:
-        ValueError: the mask is empty, or so small or thin that it has no closed surface.
+    It encloses the volume of that body (internal holes counted as tissue) to about 0.01 %. ``mask`` is a 3D
+    image, non-zero inside the body, of any spacing [mm], origin and direction; ``faces`` is the number of
+    triangles, met within a few. Raises ValueError where the mask is empty, or so small or thin that it has no
+    closed surface.
     """
     solid, corner = _largest_solid(mask)
     spacing = np.array(mask.GetSpacing())
@@ -110,7 +104,8 @@ def _iso_surface(solid: np.ndarray, spacing: np.ndarray, step: float) -> trimesh
 
 
 def _one_solid(levels: np.ndarray, clear_of_zero: float) -> np.ndarray:
-    """Keep the largest region of negative levels, without cavities; no level nearer to zero than stated.
+    """Levels of which only the largest region of negative ones is left, without cavities; none is nearer to
+    zero than stated.
 
     The low-pass filter may cut a thin bridge or close a cleft, and a level of exactly zero gives triangles of
     zero area.
@@ -137,8 +132,8 @@ def decimate(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
 
 
 def _even_triangles(coarse: trimesh.Trimesh, fine: trimesh.Trimesh, iterations: int = 8) -> trimesh.Trimesh:
-    """Move the vertices along the fine surface towards the mean of their neighbours (tangential Laplacian
-    smoothing).
+    """The coarse surface with its vertices moved along the fine one towards the mean of their neighbours
+    (tangential Laplacian smoothing).
 
     Edge collapse leaves needles, which have poor contact normals and skinning weights. Connectivity and shape
     are kept: each iteration projects onto the fine surface.

@@ -41,11 +41,8 @@ class _Structure:
 def fill_missing_slices(labels: LabelMap, organ: list[int]) -> tuple[LabelMap, tuple[str, ...]]:
     """The labels with what is missing of an organ, its tumours and cysts, and warnings that name the slices.
 
-    Slices may be drawn along any axis.
-
-    Args:
-        labels: on any grid.
-        organ: values of the organ.
+    ``organ`` are the label values of the organ. Labels may be on any grid, and slices may be drawn along any
+    axis.
     """
     lesions = {tissue: values for tissue in LESIONS if (values := labels.of_tissues(tissue))}
     everything = list(labels.segments)
@@ -128,11 +125,8 @@ def _gaps(inside: np.ndarray, known: np.ndarray, most: int, least: float) -> Ite
     """First slice, and the one after the last, of gaps that may be missing: much is labelled on both sides
     and not between them.
 
-    Args:
-        inside: the structure, slices along the first axis.
-        known: what is labelled.
-        most: slices of a gap.
-        least: pixels.
+    ``inside`` is the structure, slices along the first axis, ``known`` what is labelled. A gap has at
+    most ``most`` slices, and at least ``least`` pixels.
     """
     inside, unknown = inside[:, ::STRIDE, ::STRIDE], ~known[:, ::STRIDE, ::STRIDE]
     # Of a small section, more or fewer pixels than its share are searched.

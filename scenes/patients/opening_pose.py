@@ -34,23 +34,19 @@ def opening_press(
     """The press that begins over the middle of the tumour, without one of the organ, from the side that can
     be reached.
 
-    Args:
-        organ: closed surface [mm], LPS, with its tumours.
-        tumour: its tumour, if there is one.
-        support: what the organ rests on.
-        gravity: its direction.
-        housing_mm: the probe's, lateral x elevation x length; the lateral axis is along the organ's long
-        axis.
+    ``organ`` is a closed surface [mm], LPS, with its tumours; ``support`` is what it rests on; ``gravity`` is
+    a direction. ``housing_mm`` is the probe's: lateral x elevation x length; the lateral axis is along the
+    organ's long axis.
     """
     middle = (organ if tumour is None else tumour).center_mass
     long_axis = np.linalg.svd(organ.vertices - organ.vertices.mean(axis=0), full_matrices=False)[2][0]
     half = np.array(housing_mm[:2]) / 2
     outward = directions_around(-np.array(gravity))
-    axes = [_axes_of(each, long_axis) for each in outward]
+    axes = [_axes_of(direction, long_axis) for direction in outward]
     surface = np.concatenate([organ.vertices, organ.triangles_center]) - middle
-    face, gap = np.array([_touching(surface @ each, half) for each in axes]).T
+    face, gap = np.array([_touching(surface @ frame, half) for frame in axes]).T
     concavity = np.maximum(depth_below_hull(organ, middle + face[:, None] * outward), 0.0)
-    blocked = [_is_under(support, middle, each, half, mm) for each, mm in zip(axes, face, strict=True)]
+    blocked = [_is_under(support, middle, frame, half, mm) for frame, mm in zip(axes, face, strict=True)]
     tilt_deg = np.degrees(np.arccos(np.clip(outward @ outward[0], -1, 1)))
     costs = face + GAP_WEIGHT * (gap + concavity) + TILT_MM_DEG * tilt_deg + BLOCKED * np.array(blocked)
     best = outward[np.argmin(costs)]

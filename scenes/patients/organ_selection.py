@@ -50,15 +50,9 @@ def find_organs(labels: LabelMap, organ: Sequence[int] | None = None) -> list[Or
     """Large connected pieces of organ, tumours and cysts, from right to left.
 
     Islands, and tumours apart from every kidney, are left out. Labels that touch are one piece, such as
-    cortex and medulla.
-
-    Args:
-        labels: tumours and cysts are recognised by their tissue.
-        organ: label values of the organ; None: those named as a kidney, or without names all but tumours,
-        cysts and vessels.
-
-    Raises:
-        PatientError: no label is an organ.
+    cortex and medulla. ``organ`` are the label values of the organ; None: those named as a kidney, or without
+    names all but tumours, cysts and vessels, which are recognised by their tissue. Raises PatientError where
+    no label is an organ.
     """
     own = organ_values(labels, organ)
     lesions = [value for value in labels.of_tissues(*LESIONS) if value not in own]
@@ -169,20 +163,20 @@ def choose_organ(pieces: list[Organ], midline: float | None, side: Side | None) 
     """The organ on the requested side; where the CT shows no body, ``side`` or the label's name replaces the
     midline.
 
-    Raises PatientError: none, several, or a name of the other side.
+    Raises PatientError where there is none, or several, or one with a name of the other side.
     """
     ends = pieces[0].centre_x_mm, pieces[-1].centre_x_mm
     if midline is None and len(pieces) == 2 and ends[1] - ends[0] > KIDNEYS_APART_MM:
         midline = 0.5 * sum(ends)
-    found = _described(pieces, midline)
+    description = _described(pieces, midline)
     unsure = midline is None or abs(pieces[0].centre_x_mm - midline) < MIDLINE_MARGIN_MM
     if unsure and len(pieces) == 1:
-        return pieces[0], _side_without_midline(pieces[0], side, found)
+        return pieces[0], _side_without_midline(pieces[0], side, description)
     chosen = pieces if side is None or midline is None else [p for p in pieces if p.side_of(midline) == side]
     if not chosen:
         raise PatientError(
-            f"no {side} kidney is labelled, found: {found}; give the side that is there, or check that the "
-            "labels are not mirrored"
+            f"no {side} kidney is labelled, found: {description}; give the side that is there, or check "
+            "that the labels are not mirrored"
         )
     # Without a midline there are several here.
     if midline is None or len(chosen) > 1:
@@ -190,9 +184,9 @@ def choose_organ(pieces: list[Organ], midline: float | None, side: Side | None) 
         advice = "--side left or --side right, or --organ with" if split else "--organ with"
         where = f" on the {side}" if side and midline is not None else ""
         raise PatientError(
-            f"{len(chosen)} organs are labelled{where}, expected one, found: {found}; give {advice} the "
-            "label of one; labels that "
-            "touch are taken together, and a label in two pieces has an empty slice"
+            f"{len(chosen)} organs are labelled{where}, expected one, found: {description}; give {advice} "
+            "the label of one; labels that touch are taken together, and a label in two pieces has an empty "
+            "slice"
         )
     actual: Side = chosen[0].side_of(midline)
     if chosen[0].named_sides == {"right" if actual == "left" else "left"}:
@@ -204,7 +198,7 @@ def choose_organ(pieces: list[Organ], midline: float | None, side: Side | None) 
     return chosen[0], actual
 
 
-def _side_without_midline(piece: Organ, side: Side | None, found: str) -> Side:
+def _side_without_midline(piece: Organ, side: Side | None, description: str) -> Side:
     """The side of the only organ where the CT does not show the midline."""
     named = next(iter(piece.named_sides)) if len(piece.named_sides) == 1 else None
     if side and named and side != named:
@@ -212,7 +206,7 @@ def _side_without_midline(piece: Organ, side: Side | None, found: str) -> Side:
     stated = side or named
     if stated is None:
         raise PatientError(
-            f"the CT does not show on which side of the body the organ is ({found}): expected the "
+            f"the CT does not show on which side of the body the organ is ({description}): expected the "
             "body's whole width and an organ off its midline; give --side left or --side right"
         )
     return stated

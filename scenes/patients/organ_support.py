@@ -57,19 +57,13 @@ MOST_COVERED = 0.1
 def mould(
     organ: trimesh.Trimesh, gravity_direction: np.ndarray, clearance_mm: float = CLEARANCE_MM
 ) -> trimesh.Trimesh:
-    """Rigid block with a mould of the organ's underside, which the organ at rest does not touch.
+    """A rigid block with a mould of the organ's underside, which the organ at rest does not touch: a
+    watertight mesh of one body, normals outward, in the organ's frame [mm].
 
-    Args:
-        organ: watertight surface at rest, normals outward; vertices [mm], shape (vertex_count, 3).
-        gravity_direction: shape (3,), any length but zero.
-        clearance_mm: gap between organ at rest and mould [mm]; the least gap is at least a quarter of it.
-
-    Returns:
-        Watertight mesh of one body, normals outward; same frame as `organ`, [mm].
-
-    Raises:
-        ValueError: gravity without direction, organ not watertight, or no shape with the
-            clearance found.
+    ``organ`` is a watertight surface at rest, normals outward, vertices (n, 3) [mm]; ``gravity_direction``
+    (3,) has any length but zero. ``clearance_mm`` is the gap between organ and mould; the least gap is at
+    least a quarter of it. Raises ValueError where gravity has no direction, the organ is not watertight, or
+    no shape with the clearance is found.
     """
     frame = _gravity_frame(np.asarray(gravity_direction, float))
     if not organ.is_watertight:
@@ -95,14 +89,9 @@ def bed_of_labels(
 ) -> trimesh.Trimesh:
     """The labelled tissue under an organ and the fat between, carved so that the organ can be lifted out.
 
-    Args:
-        organ: watertight surface [mm], LPS.
-        labels: the labels around it.
-        own: label values of the organ, and of tissue that is not solid.
-        gravity: its direction, shape (3,).
-
-    Raises:
-        PatientError: less than half of the organ has labelled tissue under it.
+    ``organ`` is a watertight surface [mm], LPS; ``labels`` are those around it, with the values ``own`` of
+    the organ and of tissue that is not solid; ``gravity`` (3,) is a direction. Raises PatientError where less
+    than half of the organ has labelled tissue under it.
     """
     frame = _gravity_frame(np.asarray(gravity, float))
     upright = _turned(organ, frame)
@@ -139,15 +128,10 @@ def bed_of_labels(
 
 
 def bed_of_file(path: Path, organ: trimesh.Trimesh, gravity: np.ndarray) -> trimesh.Trimesh:
-    """A support from a file [mm], LPS unless it states RAS.
+    """A support from an STL, PLY or OBJ file [mm], LPS unless it states RAS.
 
-    Args:
-        path: of an STL, PLY or OBJ file.
-        organ: watertight surface [mm], LPS.
-        gravity: its direction, shape (3,).
-
-    Raises:
-        PatientError: not a closed surface, overlaps the organ, far from it, or not under it.
+    ``organ`` is a watertight surface [mm], LPS; ``gravity`` (3,) is a direction. Raises PatientError where
+    the file's surface is not closed, overlaps the organ, is far from it, or is not under it.
     """
     if not path.is_file():
         raise PatientError(

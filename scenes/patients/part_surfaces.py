@@ -49,7 +49,7 @@ def organ_surface(piece: Organ) -> trimesh.Trimesh:
 
 def part_masks(labels: LabelMap, piece: Organ) -> PartMasks:
     """Masks of the parts in the organ, and of vessels and collecting system near it."""
-    found = {}
+    masks = {}
     for tissue in PARTS:
         values = labels.of_tissues(*(VESSELS if tissue == "vessel" else (tissue,)))
         if not values:
@@ -58,19 +58,19 @@ def part_masks(labels: LabelMap, piece: Organ) -> PartMasks:
         if tissue in HILAR:
             grid, inside = near_organ(labels, piece, values)
         if inside.any():
-            found[tissue] = grid, inside
-    return found
+            masks[tissue] = grid, inside
+    return masks
 
 
 def parts_elsewhere(
-    labels: LabelMap, piece: Organ, pieces: Sequence[Organ], found: PartMasks, given: Collection[str]
+    labels: LabelMap, piece: Organ, pieces: Sequence[Organ], masks: PartMasks, assigned: Collection[str]
 ) -> list[str]:
-    """Notes of the given tissues whose labels are not in ``found``, the parts of one of the organs."""
+    """Notes of the assigned tissues whose labels are not in ``masks``, the parts of one of the organs."""
     notes = []
-    for tissue in given:
+    for tissue in assigned:
         values = labels.of_tissues(tissue)
         part = "vessel" if tissue in VESSELS else tissue
-        if not values or part not in PARTS or part in found:
+        if not values or part not in PARTS or part in masks:
             continue
         if tissue in HILAR:
             notes.append(f"the {tissue}'s label is more than {PEDICLE_MM:g} mm from this kidney")
@@ -81,24 +81,24 @@ def parts_elsewhere(
 
 @contextmanager
 def part_surfaces_in_processes(
-    found: PartMasks,
+    masks: PartMasks,
 ) -> Iterator[Callable[[Progress], dict[str, trimesh.Trimesh]]]:
     """Start to make the surfaces of all parts, in processes where they are large; yield a function that waits
     for them.
 
     Raises PatientError where a tumour or cyst has no surface.
     """
-    jobs = min(cpu_count(), len(found))
-    if jobs < 2 or sum(_area_mm2(*part) for part in found.values()) < PROCESSES_FROM_MM2:
+    jobs = min(cpu_count(), len(masks))
+    if jobs < 2 or sum(_area_mm2(*part) for part in masks.values()) < PROCESSES_FROM_MM2:
         yield lambda progress: _without_empty(
-            (t, part_surface(*found[t], t)) for t in progress(found, "surfaces")
+            (t, part_surface(*masks[t], t)) for t in progress(masks, "surfaces")
         )
         return
     with ProcessPoolExecutor(jobs) as pool:
         # The last parts take longest.
-        made = {tissue: pool.submit(part_surface, *found[tissue], tissue) for tissue in reversed(found)}
+        made = {tissue: pool.submit(part_surface, *masks[tissue], tissue) for tissue in reversed(masks)}
         try:
-            yield lambda progress: _without_empty((t, made[t].result()) for t in progress(found, "surfaces"))
+            yield lambda progress: _without_empty((t, made[t].result()) for t in progress(masks, "surfaces"))
         except BrokenExecutor:
             raise PatientError(
                 "a process that made surfaces was ended, perhaps for lack of memory; close other programs "
@@ -112,8 +112,8 @@ def _without_empty(made: Iterable[tuple[str, trimesh.Trimesh | None]]) -> dict[s
 
 def colours_of_labels(labels: LabelMap, tissues: Sequence[str]) -> dict[str, Colour]:
     """Colours of the organ and its parts in the label files."""
-    found = {s.tissue: s.colour for s in reversed(labels.segments.values()) if s.tissue and s.colour}
-    named = {"organ": found.get("kidney"), **{tissue: found.get(tissue) for tissue in tissues}}
+    colours = {s.tissue: s.colour for s in reversed(labels.segments.values()) if s.tissue and s.colour}
+    named = {"organ": colours.get("kidney"), **{tissue: colours.get(tissue) for tissue in tissues}}
     return {name: colour for name, colour in named.items() if colour}
 
 

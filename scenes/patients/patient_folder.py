@@ -23,16 +23,11 @@ def save_patient(
     draw: Callable[[Path], None] | None = None,
 ) -> None:
     """Write ct.nrrd, labels.nrrd, corrections.nrrd if there are any, organ.stl, support.stl and a surface for
-    each part: all or nothing.
+    each part into a folder: all or nothing.
 
-    Args:
-        patient: only its voxels and geometry are written.
-        folder: new or empty.
-        texts: further text files (the scene), name -> content.
-        draw: writes further files into a folder (the check image).
-
-    Raises:
-        PatientError: the folder exists and is not empty, or cannot be written.
+    Of the patient only voxels and geometry are written. ``texts`` are further text files (the scene) by name;
+    ``draw`` writes further files into a folder (the check image). Raises PatientError where the folder exists
+    and is not empty, or cannot be written.
     """
     with new_folder(folder) as partial:
         _write(patient, partial, texts or {})

@@ -105,7 +105,7 @@ def import_patient(
     side: Side | None = None,
     margin_mm: float = 60.0,
     support: str = "mould",
-    given: Collection[str] = (),
+    assigned: Collection[str] = (),
     drawn: Sequence[LabelMap] = (),
     position: Position | None = None,
     progress: Progress = silent,
@@ -113,23 +113,20 @@ def import_patient(
 ) -> Patient:
     """Crop one organ from a CT and its label map, and make its surfaces and its support.
 
-    Args:
-        ct: scalar volume [HU]; only the part around the organ is read.
-        labels: on any grid; surfaces are made on it, and resampled to the CT's by nearest neighbour.
-        organ: label values of the organ; None: those named as a kidney, or all that are nothing else.
-        side: which of two kidneys, or a check of the only one; needed where neither the CT nor the labels'
-        names show the
-            side.
-        margin_mm: CT kept around the organ [mm].
-        support: what the organ rests on: a "mould" of its underside, a bed of the surrounding "labels", or a
-        surface file. given: tissues whose labels the user named: a note tells which of them this organ does
-        not have. drawn: the label maps before they were merged: some segments may be covered in ``labels``;
-        none: they are ``labels``. position: how the patient lay in the CT; None: as in its header, else
-        supine. progress: shows the progress of the surfaces.
-        classes: of class images, which correct the tissues around the organ and of its parts.
+    ``ct`` is a scalar volume [HU], of which only the part around the organ is read, up to ``margin_mm`` from
+    it. ``labels`` may be on any grid; surfaces are made on it, and it is resampled to the CT's by nearest
+    neighbour. ``drawn`` are the label maps before they were merged, as some segments may be covered in
+    ``labels``; none: they are ``labels``. ``classes`` are those of class images, which correct the tissues
+    around the organ and of its parts.
 
-    Raises:
-        PatientError: what was found, what was expected and what to do.
+    ``organ`` are the label values of the organ; None: those named as a kidney, or all that are nothing else.
+    ``assigned`` are the tissues whose labels the user named: a note tells which of them this organ does not
+    have. ``side`` selects one of two kidneys, or checks the only one; it is needed where neither the CT nor
+    the labels' names show the side. ``support`` is what the organ rests on: a "mould" of its underside, a bed
+    of the surrounding "labels", or a surface file. ``position`` is how the patient lay in the CT; None: as in
+    its header, else supine. ``progress`` shows the progress of the surfaces.
+
+    Raises PatientError, which names what was found, what was expected and what to do.
     """
     if not margin_mm >= 0:
         raise PatientError(f"the margin is {margin_mm} mm: expected 0 or more")
@@ -153,9 +150,9 @@ def import_patient(
         *orientation_warnings(overview, labels, midline, float(piece.grid.corners()[:, 2].mean())),
         *_misplaced(piece, grid, hounsfield, on_ct, coded),
     )
-    found = part_masks(labels, piece)
-    part_notes = parts_elsewhere(labels, piece, pieces, found, given)
-    with part_surfaces_in_processes(found) as parts_made:
+    masks = part_masks(labels, piece)
+    part_notes = parts_elsewhere(labels, piece, pieces, masks, assigned)
+    with part_surfaces_in_processes(masks) as parts_made:
         surface = organ_surface(piece)
         _check_surface(surface, piece)
         of_ct = grid, hounsfield, coded, tissues, surface
@@ -170,7 +167,7 @@ def import_patient(
         )
         bed = _support(support, surface, labels, piece, actual_position)
         parts = parts_made(progress)
-    volumes = {part: float(inside.sum() * part_grid.voxel_ml) for part, (part_grid, inside) in found.items()}
+    volumes = {part: float(inside.sum() * part_grid.voxel_ml) for part, (part_grid, inside) in masks.items()}
     return Patient(
         ct=grid.image(hounsfield),
         labels=grid.image(coded),
@@ -275,10 +272,10 @@ def _cropped(
     grid: VoxelGrid, slab: Box, hounsfield: np.ndarray, piece: Organ, margin_mm: float
 ) -> tuple[VoxelGrid, np.ndarray]:
     """The CT around the organ: its grid and its HU (z, y, x)."""
-    found = grid.index(piece.grid.corners())
+    indices = grid.index(piece.grid.corners())
     rim = margin_mm / grid.spacing
-    low = np.floor(found.min(axis=0) - rim).astype(int)
-    high = np.ceil(found.max(axis=0) + rim).astype(int) + 1
+    low = np.floor(indices.min(axis=0) - rim).astype(int)
+    high = np.ceil(indices.max(axis=0) + rim).astype(int) + 1
     box = tuple(
         slice(max(int(a), s.start), min(int(b), s.stop)) for a, b, s in zip(low, high, slab, strict=True)
     )

@@ -56,18 +56,18 @@ CLEARLY = 2.0
 LEVEL_DEPTH = 2
 
 
-def position_of(term: str, given: Position | None) -> tuple[Position, tuple[str, ...]]:
+def position_of(term: str, of_user: Position | None) -> tuple[Position, tuple[str, ...]]:
     """The patient's position: the user's, else that of DICOM's PatientPosition, else supine; and notes of
     what was chosen.
 
     ``term`` is DICOM's, such as HFS or FFDL; it may be empty, or none that DICOM has.
     """
-    found = TERM.fullmatch(term)
-    of_header = OF_TERM[found[1]] if found else None
-    if given and of_header and given != of_header:
-        return given, (f"the patient is {LYING[given]}, as given; the CT's header has {term}",)
-    if given or of_header:
-        return given or of_header or "supine", ()
+    match = TERM.fullmatch(term)
+    of_header = OF_TERM[match[1]] if match else None
+    if of_user and of_header and of_user != of_header:
+        return of_user, (f"the patient is {LYING[of_user]}, as given; the CT's header has {term}",)
+    if of_user or of_header:
+        return of_user or of_header or "supine", ()
     reason = "PatientPosition is not one of DICOM's" if term else "the CT has no PatientPosition"
     return "supine", (f"assumed supine, as {reason}: --position gives another",)
 
@@ -93,12 +93,12 @@ def seen_position(ct: sitk.Image) -> Position | None:
     """
     hounsfield = _along_patient_axes(ct)
     body = _body(hounsfield)
-    found = {
+    positions = {
         _clear(_table_shares(hounsfield, body), LEAST_TABLE),
         _clear(_levels_cm2(hounsfield, body), LEAST_LEVELS_CM2),
     }
-    found.discard(None)
-    return found.pop() if len(found) == 1 else None
+    positions.discard(None)
+    return positions.pop() if len(positions) == 1 else None
 
 
 def _along_patient_axes(ct: sitk.Image) -> np.ndarray:

@@ -44,14 +44,9 @@ def draft_segmentation(ct: LazyVolume, seed_mm: np.ndarray) -> LabelMap:
     """The kidney around a seed, on the CT's grid; deterministic.
 
     It uses tissue and shape, not anatomy: from a seed in another compact organ surrounded by fat, it returns
-    that organ.
-
-    Args:
-        ct: scalar volume [HU]; read within REACH_MM of the seed.
-        seed_mm: a point in the parenchyma, LPS [mm], shape (3,).
-
-    Raises:
-        PatientError: the seed is not in kidney tissue, or no region around it is like a kidney.
+    that organ. ``ct`` is a scalar volume [HU], read within REACH_MM of the seed; ``seed_mm`` (3,) is a point
+    in the parenchyma, LPS. Raises PatientError where the seed is not in kidney tissue, or no region around it
+    is like a kidney.
     """
     seed = np.asarray(seed_mm, float)
     _check_in(ct.grid, seed)
@@ -94,7 +89,7 @@ def _most_like_a_kidney(tissue: sitk.Image, seed: np.ndarray) -> np.ndarray:
     start = _start(tissue, hounsfield, seed)
     away = _distance(hounsfield, start)
     level = _level(hounsfield, away)
-    found, regions = _grown(tissue, hounsfield, away, level)
+    masks, regions = _grown(tissue, hounsfield, away, level)
     if regions:
         first = max(regions, key=lambda region: region.rank)
         # A seed near the surface, in a pyramid or in noise has not the HU of the organ.
@@ -104,13 +99,13 @@ def _most_like_a_kidney(tissue: sitk.Image, seed: np.ndarray) -> np.ndarray:
             regions += [region for region in again if away[region.inside].min() <= OFF_SEED_MM]
     best = max(regions, key=lambda region: region.rank, default=None)
     if best is None or not (best.is_kidney and best.is_whole):
-        raise _refusal(seed, *_why_none(VoxelGrid.of(tissue), hounsfield, start, found, regions))
+        raise _refusal(seed, *_why_none(VoxelGrid.of(tissue), hounsfield, start, masks, regions))
     return best.inside
 
 
 def _start(tissue: sitk.Image, hounsfield: np.ndarray, seed: np.ndarray) -> np.ndarray:
-    """The voxel (x, y, z) near the seed with the most soft tissue around it. Raises PatientError: the seed is
-    in none.
+    """The voxel (x, y, z) near the seed with the most soft tissue around it. Raises PatientError where the
+    seed is in none.
 
     In thick voxels, the cortex near the surface has the HU of the fat beside it.
     """
@@ -143,8 +138,8 @@ def _check_parenchyma(level: float, seed: np.ndarray) -> None:
     least, most = PARENCHYMA_HU
     if not least <= level <= most:
         tissue = ("air", "fat", "bone, stone or contrast agent")[(level >= AIR_BELOW_HU) + (level > most)]
-        found = f"it is in {tissue}, {level:.0f} HU, where a kidney has {least:g} to {most:g}"
-        raise _refusal(seed, found, "give a point in the parenchyma")
+        reason = f"it is in {tissue}, {level:.0f} HU, where a kidney has {least:g} to {most:g}"
+        raise _refusal(seed, reason, "give a point in the parenchyma")
 
 
 def _bands(level: float) -> list[tuple[float, float]]:
@@ -159,9 +154,9 @@ def _grown(
     tissue: sitk.Image, hounsfield: np.ndarray, away: np.ndarray, level: float
 ) -> tuple[list[np.ndarray], list[Region]]:
     """All regions (z, y, x) around a start, and those with the volume of a kidney."""
-    found = [inside for low, high in _bands(level) for inside in _opened_regions(tissue, away, low, high)]
+    masks = [inside for low, high in _bands(level) for inside in _opened_regions(tissue, away, low, high)]
     least, most = VOLUME_ML
-    return found, [Region.of(inside, hounsfield) for inside in found if least <= _ml(inside) <= most]
+    return masks, [Region.of(inside, hounsfield) for inside in masks if least <= _ml(inside) <= most]
 
 
 def _opened_regions(tissue: sitk.Image, away: np.ndarray, low: float, high: float) -> Iterator[np.ndarray]:
@@ -209,7 +204,7 @@ def _ml(inside: np.ndarray) -> float:
 
 
 def _why_none(
-    grid: VoxelGrid, hounsfield: np.ndarray, start: np.ndarray, found: list[np.ndarray], regions: list[Region]
+    grid: VoxelGrid, hounsfield: np.ndarray, start: np.ndarray, masks: list[np.ndarray], regions: list[Region]
 ) -> tuple[str, str]:
     """What was found instead of a kidney, and what to do."""
     if any(region.is_kidney for region in regions):
@@ -218,10 +213,10 @@ def _why_none(
     whole = [region for region in regions if region.is_whole]
     if whole:
         return _why_unlike(grid, max(whole, key=lambda region: region.rank)), ELSEWHERE
-    large = [inside for inside in found if _ml(inside) >= VOLUME_ML[0]]
+    large = [inside for inside in masks if _ml(inside) >= VOLUME_ML[0]]
     if large:
         return _where_it_leaks(grid, hounsfield, start, min(large, key=_ml)), ELSEWHERE
-    most = max(map(_ml, found), default=0.0)
+    most = max(map(_ml, masks), default=0.0)
     advice = "give a point in the parenchyma, not in a cyst, tumour or vessel, or draw labels"
     return f"the region has only {most:.0f} ml, where a kidney has at least {VOLUME_ML[0]:g}", advice
 
@@ -257,5 +252,5 @@ def _towards(grid: VoxelGrid, steps: np.ndarray) -> str:
     return " and ".join(words for _, words in components(grid.direction @ steps))
 
 
-def _refusal(seed: np.ndarray, found: str, advice: str = ELSEWHERE) -> PatientError:
-    return PatientError(f"no kidney at the seed {','.join(f'{x:g}' for x in seed)} mm: {found}; {advice}")
+def _refusal(seed: np.ndarray, reason: str, advice: str = ELSEWHERE) -> PatientError:
+    return PatientError(f"no kidney at the seed {','.join(f'{x:g}' for x in seed)} mm: {reason}; {advice}")

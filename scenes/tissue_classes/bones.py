@@ -11,7 +11,7 @@ COARSE_MM, BEYOND_MM = 1.8, 45.0
 
 
 def bones(hu: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return cortical bone and marrow.
+    """Cortical bone and marrow.
 
     Marrow may be no denser than enhanced soft tissue, but is enclosed by cortical bone.
     """
@@ -32,8 +32,8 @@ def bones(hu: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
 
 
 def spine_middle(bone: np.ndarray) -> np.ndarray | None:
-    """Return the index (3,), fractional, of the middle of the spine, the largest bone (nx, ny, nz); None
-    without a bone.
+    """The index (3,), fractional, of the middle of the spine, the largest bone (nx, ny, nz); None without a
+    bone.
     """
     parts, count = ndimage.label(bone)
     if count == 0:
@@ -42,7 +42,7 @@ def spine_middle(bone: np.ndarray) -> np.ndarray | None:
 
 
 def _filled(solid: np.ndarray, axis: int) -> np.ndarray:
-    """Fill the holes of each section across an axis."""
+    """The mask with the holes of each section across an axis filled."""
     beside = ndimage.generate_binary_structure(3, 1)
     beside[tuple(slice(None) if k != axis else [0, 2] for k in range(3))] = False
     parts, count = ndimage.label(~solid, beside)
@@ -55,7 +55,7 @@ def _filled(solid: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _large_parts(hu: np.ndarray, voxel_mm3: float) -> np.ndarray:
-    """Return the connected parts above SHELL_ABOVE_HU that contain MIN_BONE_ML above BONE_ABOVE_HU."""
+    """The connected parts above SHELL_ABOVE_HU that contain MIN_BONE_ML above BONE_ABOVE_HU."""
     parts, count = ndimage.label(hu > SHELL_ABOVE_HU)
     hard = np.bincount(parts[hu > BONE_ABOVE_HU], minlength=count + 1) * voxel_mm3 / 1000
     is_bone = hard >= MIN_BONE_ML

@@ -46,12 +46,10 @@ class DensePieces:
 
 
 def dense_pieces(hu: np.ndarray, parenchyma: np.ndarray, kidney: np.ndarray, voxel_ml: float) -> DensePieces:
-    """Return the dense pieces of a kidney.
+    """The dense pieces of a kidney.
 
-    Args:
-        hu: not smoothed, so that small stones remain; (nx, ny, nz).
-        parenchyma: whose HU all others are compared with.
-        kidney: with its hollow, in which pieces begin.
+    ``hu`` (nx, ny, nz) are not smoothed, so that small stones remain; all are compared with those of the
+    ``parenchyma``. Pieces begin in ``kidney``, which includes its hollow.
     """
     median = median_hu(hu, parenchyma)
     is_enhanced = median > ENHANCED_FROM_HU
@@ -69,8 +67,8 @@ def dense_pieces(hu: np.ndarray, parenchyma: np.ndarray, kidney: np.ndarray, vox
 
 
 def agent_in_bone(bone: np.ndarray, urine: np.ndarray) -> np.ndarray:
-    """Return the pieces (nx, ny, nz) of what was taken for bone, but is contrast agent of the collecting
-    system, and what is around it.
+    """The pieces (nx, ny, nz) of what was taken for bone, but is contrast agent of the collecting system, and
+    what is around it.
     """
     pieces, count = ndimage.label(bone)
     sizes = np.bincount(pieces.ravel(), minlength=count + 1)
@@ -83,15 +81,11 @@ def agent_in_bone(bone: np.ndarray, urine: np.ndarray) -> np.ndarray:
 def pelvis_without_agent(
     hu: np.ndarray, parenchyma: np.ndarray, kidney: np.ndarray, outer_mm: np.ndarray, spacing_mm: np.ndarray
 ) -> np.ndarray:
-    """Return a mask (nx, ny, nz) of a renal pelvis with urine alone; one that is not dilated is not seen by
-    HU.
+    """A mask (nx, ny, nz) of a renal pelvis with urine alone; one that is not dilated is not seen by HU.
 
-    Args:
-        hu: smoothed.
-        parenchyma: whose HU decide whether there is contrast agent.
-        kidney: what is no pelvis.
-        outer_mm: distance from the kidney's outer surface, its hollow filled, which is where this is
-        negative.
+    ``hu`` are smoothed; those of the ``parenchyma`` decide whether there is contrast agent. ``kidney`` is
+    what is no pelvis. ``outer_mm`` is the distance from the kidney's outer surface, its hollow filled, which
+    is where this is negative.
     """
     median = median_hu(hu, parenchyma)
     low, high = URINE_HU if median > ENHANCED_FROM_HU else (median + off for off in URINE_AGAINST_MEDIAN_HU)

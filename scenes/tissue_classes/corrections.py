@@ -11,14 +11,14 @@ from scenes.volumes.voxel_grid import VoxelGrid
 
 
 def with_corrections(
-    found: TissueMap, values: np.ndarray, index_from_mm: np.ndarray, tissues: Mapping[int, str]
+    tissue_map: TissueMap, values: np.ndarray, index_from_mm: np.ndarray, tissues: Mapping[int, str]
 ) -> TissueMap:
-    """Return a map with the tissues of ``values`` (nx, ny, nz), 0 where nothing is corrected, on the grid
-    of ``index_from_mm`` (4, 4).
+    """A map with the tissues of ``values`` (nx, ny, nz), 0 where nothing is corrected, on the grid of
+    ``index_from_mm`` (4, 4).
     """
-    fine = VoxelGrid.of_transform(found.index_from_mm, found.codes.shape)
+    fine = VoxelGrid.of_transform(tissue_map.index_from_mm, tissue_map.codes.shape)
     codes = codes_of_labels(values, tissues).transpose(2, 1, 0)
     image = VoxelGrid.of_transform(index_from_mm, values.shape).image(np.ascontiguousarray(codes))
     there = fine.sampled(image, sitk.sitkNearestNeighbor, 0).transpose(2, 1, 0)
-    drawn = found.drawn & (there == 0)
-    return replace(found, codes=np.where(there > 0, there, found.codes), drawn=drawn)
+    drawn = tissue_map.drawn & (there == 0)
+    return replace(tissue_map, codes=np.where(there > 0, there, tissue_map.codes), drawn=drawn)

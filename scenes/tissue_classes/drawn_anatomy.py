@@ -27,8 +27,8 @@ SHEETS_MM, SHEETS_ABOVE, SHEETS_OVER_MM, SEED = 4.0, -0.2, 4.0, 20151124
 def draw_pyramids(
     parenchyma: np.ndarray, sinus: np.ndarray, depth_mm: np.ndarray, spacing_mm: np.ndarray
 ) -> np.ndarray:
-    """Return pyramids (nx, ny, nz) in parenchyma: cones with their bases CORTEX_MM below the surface, their
-    papillae at the sinus.
+    """Pyramids (nx, ny, nz) in parenchyma: cones with their bases CORTEX_MM below the surface, their papillae
+    at the sinus.
 
     ``depth_mm`` is below the kidney's outer surface. Without a sinus, the papillae are at the deepest place.
     """
@@ -60,7 +60,7 @@ def draw_pyramids(
 
 
 def _spread(points: np.ndarray) -> list[int]:
-    """Return indices of points (n, 3) [mm] that are APART_MM from each other, each the farthest from those
+    """Indices of points (n, 3) [mm] that are APART_MM from each other, each the farthest from those
     before.
     """
     chosen = [int(np.argmax(points @ [0.0, 0.0, 1.0]))]
@@ -74,8 +74,8 @@ def _spread(points: np.ndarray) -> list[int]:
 def draw_fascia(
     fat: np.ndarray, others: np.ndarray, from_kidney_mm: np.ndarray, spacing_mm: np.ndarray
 ) -> np.ndarray:
-    """Return the renal fascia (nx, ny, nz): a sheet in the perirenal fat, one voxel thick, before what is
-    behind the fat.
+    """The renal fascia (nx, ny, nz): a sheet in the perirenal fat, one voxel thick, before what is behind the
+    fat.
     """
     # Islands are nothing that fat has its fascia before.
     behind = ndimage.binary_opening(others, iterations=OPENED_VOXELS)
@@ -84,9 +84,7 @@ def draw_fascia(
 
 
 def draw_perimysium(muscle: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return broken sheets (nx, ny, nz) of connective tissue in muscle, one voxel thick, parallel to its
-    surface.
-    """
+    """Broken sheets (nx, ny, nz) of connective tissue in muscle, one voxel thick, parallel to its surface."""
     # Noise of one value a cell, between which it is interpolated.
     step = cell_voxels(spacing_mm)
     cells = -(-np.array(muscle.shape) // step)

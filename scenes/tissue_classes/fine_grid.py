@@ -26,13 +26,13 @@ Box = tuple[slice, ...]
 
 
 def fine_factors(spacing_mm: np.ndarray) -> np.ndarray:
-    """Return into how many voxels each is divided along each axis (3,)."""
+    """The number of voxels into which each is divided along each axis (3,)."""
     return np.maximum(np.ceil(np.asarray(spacing_mm) / LONGEST_MM - 1e-6), 1).astype(int)
 
 
 def fine_index_from_mm(index_from_mm: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Return the transform (4, 4) from mm to the indices of the finer grid, whose first voxel begins where
-    the CT's first does.
+    """The transform (4, 4) from mm to the indices of the finer grid, whose first voxel begins where the CT's
+    first does.
     """
     scale = np.diag([*factors.astype(float), 1.0])
     scale[:3, 3] = (factors - 1) / 2
@@ -40,7 +40,7 @@ def fine_index_from_mm(index_from_mm: np.ndarray, factors: np.ndarray) -> np.nda
 
 
 def refined(values: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Return values (nx, ny, nz) float32 on the finer grid, linear between the voxels' centres."""
+    """Values (nx, ny, nz) float32 on the finer grid, linear between the voxels' centres."""
     fine = np.asarray(values, np.float32)
     for axis, factor in enumerate(factors):
         if factor > 1:
@@ -54,9 +54,7 @@ def refined(values: np.ndarray, factors: np.ndarray) -> np.ndarray:
 
 
 def refined_labels(labels: np.ndarray, factors: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return labels on the finer grid: of each voxel the label that it is deepest in, 0 where it is in
-    none.
-    """
+    """Labels on the finer grid: of each voxel the label that it is deepest in, 0 where it is in none."""
     if (factors == 1).all():
         return labels
     fine = np.zeros(np.array(labels.shape) * factors, labels.dtype)
@@ -74,8 +72,8 @@ def refined_labels(labels: np.ndarray, factors: np.ndarray, spacing_mm: np.ndarr
 
 
 def signed_distance_of(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return distances [mm] (nx, ny, nz) from the voxels of a mask less those from the voxels outside;
-    negative inside.
+    """Distances [mm] (nx, ny, nz) from the voxels of a mask less those from the voxels outside; negative
+    inside.
 
     Linear between neighbours, it is 0 halfway between a voxel inside and one outside, however long voxels are
     along an axis.
@@ -85,8 +83,8 @@ def signed_distance_of(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
 
 
 def coarse_distance(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return distances [mm] (nx, ny, nz) of the voxels of a mask from those outside it, computed in cells of
-    about CELL_MM, and interpolated.
+    """Distances [mm] (nx, ny, nz) of the voxels of a mask from those outside it, computed in cells of about
+    CELL_MM, and interpolated.
 
     A cell belongs to the mask if half of its voxels do.
     """
@@ -98,29 +96,28 @@ def coarse_distance(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
 
 
 def cell_voxels(spacing_mm: np.ndarray, cell_mm: float = CELL_MM) -> np.ndarray:
-    """Return how many voxels (3,) a cell of about ``cell_mm`` has along each axis."""
+    """How many voxels (3,) a cell of about ``cell_mm`` has along each axis."""
     return np.maximum(np.rint(cell_mm / spacing_mm), 1).astype(int)
 
 
 def repeated(coarse: np.ndarray, step: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the values of cells of so many voxels (3,) at the voxels of a grid."""
+    """The values of cells of so many voxels (3,) at the voxels of a grid."""
     fine = coarse.repeat(step[0], 0).repeat(step[1], 1).repeat(step[2], 2)
     return fine[: shape[0], : shape[1], : shape[2]]
 
 
 def box_around(mask: np.ndarray, voxels: int) -> Box:
-    """Return the box around a mask that is not empty, some voxels wider, within its grid."""
-    found = ndimage.find_objects(mask.astype(np.uint8))[0]
+    """The box around a mask that is not empty, some voxels wider, within its grid."""
+    box = ndimage.find_objects(mask.astype(np.uint8))[0]
     return tuple(
-        slice(max(a.start - voxels, 0), min(a.stop + voxels, n))
-        for a, n in zip(found, mask.shape, strict=True)
+        slice(max(a.start - voxels, 0), min(a.stop + voxels, n)) for a, n in zip(box, mask.shape, strict=True)
     )
 
 
 def surface_box(
     surface: trimesh.Trimesh, index_from_mm: np.ndarray, shape: tuple[int, ...], margin_mm: float
 ) -> Box:
-    """Return the voxels of a grid around a surface, with a margin."""
+    """The voxels of a grid around a surface, with a margin."""
     corners = trimesh.bounds.corners(surface.bounds + [[-margin_mm], [margin_mm]])
     at = corners @ index_from_mm[:3, :3].T + index_from_mm[:3, 3]
     low = np.clip(np.floor(at.min(axis=0)), 0, np.array(shape) - 1).astype(int)
@@ -141,8 +138,8 @@ class SurfaceGrid:
         self.distance = distances_on_grid(surface, self.low, tuple(counts), SURFACE_MM, EXACT_MM)
 
     def at_voxels(self, values: np.ndarray, box: Box, index_from_mm: np.ndarray) -> np.ndarray:
-        """Return values of this grid at the voxels of a box, float32, linear between points; of the
-        nearest point outside the grid.
+        """Values of this grid at the voxels of a box, float32, linear between points; of the nearest point
+        outside the grid.
         """
         mm_from_index = np.linalg.inv(index_from_mm)
         first = mm_from_index[:3, :3] @ [a.start for a in box] + mm_from_index[:3, 3]

@@ -25,21 +25,19 @@ PARENCHYMA_ABOVE_HU = 30.0
 
 
 def median_hu(hu: np.ndarray, parenchyma: np.ndarray) -> float:
-    """Return the median HU of parenchyma; 0 of none."""
+    """The median HU of parenchyma; 0 of none."""
     return float(np.median(hu[parenchyma])) if parenchyma.any() else 0.0
 
 
 def kidney_parts(
     hu: np.ndarray, parenchyma: np.ndarray, hollow: np.ndarray, depth_mm: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return masks (nx, ny, nz) of the parts of a kidney by tissue, apart from each other: "kidney", or
-    "cortex" and "medulla", and others.
+    """Masks (nx, ny, nz) of the parts of a kidney by tissue, apart from each other: "kidney", or "cortex" and
+    "medulla", and others.
 
-    Args:
-        hu: smoothed.
-        parenchyma: what is labelled as kidney, and as no part of it.
-        hollow: what the kidney encloses outside its label.
-        depth_mm: below the kidney's outer surface, its hollow filled.
+    ``hu`` are smoothed. ``parenchyma`` is what is labelled as kidney and as no part of it, ``hollow`` what
+    the kidney encloses outside its label; ``depth_mm`` is below the kidney's outer surface, its hollow
+    filled.
     """
     median = median_hu(hu, parenchyma)
     is_enhanced = median > ENHANCED_FROM_HU
@@ -60,7 +58,7 @@ def kidney_parts(
 def cortex_and_medulla_hu(
     hu: np.ndarray, parenchyma: np.ndarray, depth_mm: np.ndarray
 ) -> tuple[float, float] | None:
-    """Return the HU of cortex and medulla; None where the phase does not tell them apart."""
+    """The HU of cortex and medulla; None where the phase does not tell them apart."""
     parenchyma = parenchyma & (hu > PARENCHYMA_ABOVE_HU)
     outer, inner = (
         hu[parenchyma & (depth_mm > low) & (depth_mm < high)] for low, high in (OUTER_MM, INNER_MM)

@@ -8,9 +8,7 @@ NECROSIS_BELOW_MEDIAN_HU, PSEUDOCAPSULE_MM = 40.0, 1.0
 
 
 def lesion_parts(hu: np.ndarray, tumour: np.ndarray, spacing_mm: np.ndarray) -> dict[str, np.ndarray]:
-    """Return masks (nx, ny, nz) of parts of a tumour by tissue; the pseudocapsule is at least one voxel
-    thick.
-    """
+    """Masks (nx, ny, nz) of parts of a tumour by tissue; the pseudocapsule is at least one voxel thick."""
     if not tumour.any():
         return {}
     depth = ndimage.distance_transform_edt(tumour, sampling=spacing_mm)

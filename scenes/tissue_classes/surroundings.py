@@ -50,7 +50,7 @@ class Place:
         return np.linalg.norm(np.linalg.inv(self.index_from_mm[:3, :3]), axis=0)
 
     def of_indices(self, index: np.ndarray) -> np.ndarray:
-        """Return places (n, 3) of indices (n, 3), from the kidney's middle [mm]."""
+        """Places (n, 3) of indices (n, 3), from the kidney's middle [mm]."""
         mm_from_index = np.linalg.inv(self.index_from_mm)
         return index @ mm_from_index[:3, :3].T + mm_from_index[:3, 3] - self.middle_mm
 
@@ -58,7 +58,7 @@ class Place:
 def surroundings(
     hu: np.ndarray, kidney: np.ndarray, bone: np.ndarray, near: tuple[slice, ...], place: Place
 ) -> dict[str, np.ndarray]:
-    """Return masks (nx, ny, nz) by tissue of what is outside a kidney, in rising priority.
+    """Masks (nx, ny, nz) by tissue of what is outside a kidney, in rising priority.
 
     ``hu`` is smoothed; ``near`` is a box around the kidney.
     """
@@ -84,8 +84,8 @@ def surroundings(
 
 
 def _oral_agent(hu: np.ndarray, bone: np.ndarray, place: Place) -> np.ndarray:
-    """Return what was taken for bone, but is contrast agent in the bowel: in front of the spine, and
-    solid, where a bone is a shell.
+    """What was taken for bone, but is contrast agent in the bowel: in front of the spine, and solid, where a
+    bone is a shell.
     """
     agent = np.zeros(bone.shape, bool)
     step = cell_voxels(place.spacing_mm, CELL_MM)
@@ -107,8 +107,8 @@ def _oral_agent(hu: np.ndarray, bone: np.ndarray, place: Place) -> np.ndarray:
 
 
 def _marrow(hu: np.ndarray, bone: np.ndarray, kidney: np.ndarray, place: Place) -> np.ndarray:
-    """Return bright pieces whose surface is bone for the most part; without contrast agent, all large
-    bright pieces.
+    """Bright pieces whose surface is bone for the most part; without contrast agent, all large bright
+    pieces.
     """
     bright = (hu > (ENHANCED_MARROW_ABOVE_HU if place.is_enhanced else MARROW_ABOVE_HU)) & ~kidney & ~bone
     pieces, count = ndimage.label(bright)
@@ -125,12 +125,12 @@ def _marrow(hu: np.ndarray, bone: np.ndarray, kidney: np.ndarray, place: Place) 
 
 
 def _dilated(mask: np.ndarray, voxels: int) -> np.ndarray:
-    """Return a mask dilated by a cube: a maximum filter is faster than a dilation."""
+    """A mask dilated by a cube: a maximum filter is faster than a dilation."""
     return ndimage.maximum_filter(mask, 2 * voxels + 1)
 
 
 def _open_air(gas: np.ndarray) -> np.ndarray:
-    """Return the gas that reaches the border of the CT: the air around the body, or a lung."""
+    """The gas that reaches the border of the CT: the air around the body, or a lung."""
     parts, count = ndimage.label(gas)
     at_border = np.zeros(count + 1, bool)
     for axis in range(3):
@@ -141,7 +141,7 @@ def _open_air(gas: np.ndarray) -> np.ndarray:
 
 
 def _near(mask: np.ndarray, distance_mm: float, place: Place) -> np.ndarray:
-    """Return what is within a distance of a mask, by steps of voxels."""
+    """What is within a distance of a mask, by steps of voxels."""
     if not mask.any():
         return mask
     step = cell_voxels(place.spacing_mm, CELL_MM)
@@ -151,7 +151,7 @@ def _near(mask: np.ndarray, distance_mm: float, place: Place) -> np.ndarray:
 
 
 def _bodies(hu: np.ndarray, soft: np.ndarray, bone: np.ndarray, place: Place) -> dict[str, np.ndarray]:
-    """Return liver, spleen and muscle, soft tissue in large bodies; and fluid."""
+    """Liver, spleen and muscle, soft tissue in large bodies; and fluid."""
     step = cell_voxels(place.spacing_mm, CELL_MM)
     cell_mm = place.spacing_mm * step
     mean, inside = block_reduce(hu, tuple(step), np.mean), block_reduce(soft, tuple(step), np.mean) >= 0.5
@@ -167,18 +167,18 @@ def _bodies(hu: np.ndarray, soft: np.ndarray, bone: np.ndarray, place: Place) ->
         level = float(np.median(mean[box][own & (deep > deep[own].max() / 3)]))
         at = place.of_indices(_middle(own, step, [axis.start for axis in box]))[0]
         names.append(_body(level, float(depth[tuple(peak)]), at, spine, place.is_enhanced))
-    found = np.array([("soft-tissue", *BODIES).index(name) for name in names])[basins]
+    cell_codes = np.array([("soft-tissue", *BODIES).index(name) for name in names])[basins]
     for code in (BODIES.index(name) + 1 for name in ("liver", "spleen")):
-        organ = found == code
+        organ = cell_codes == code
         if not organ.any():
             continue
         # What no ball fits into is the wall of the abdomen beside it.
         from_core = ndimage.distance_transform_edt(~(organ & (depth > BODY_MM)), sampling=cell_mm)
-        found[organ & (from_core > BODY_MM + CELL_MM)] = BODIES.index("muscle") + 1
-    codes = repeated(found.astype(np.uint8), step, soft.shape)
+        cell_codes[organ & (from_core > BODY_MM + CELL_MM)] = BODIES.index("muscle") + 1
+    codes = repeated(cell_codes.astype(np.uint8), step, soft.shape)
     low, high = _fluid_hu(place.is_enhanced)
     # The opening leaves nothing of layers that soft tissue and fat have in common.
-    fluid = inside & (found != BODIES.index("muscle") + 1) & (mean > low) & (mean < high)
+    fluid = inside & (cell_codes != BODIES.index("muscle") + 1) & (mean > low) & (mean < high)
     fluid = ndimage.binary_opening(fluid, iterations=FLUID_CELLS)
     near_fluid = repeated(ndimage.binary_dilation(fluid), step, soft.shape)
     masks = {name: soft & (codes == code) for code, name in enumerate(BODIES, 1)}
@@ -190,16 +190,14 @@ def _fluid_hu(is_enhanced: bool) -> tuple[float, float]:
 
 
 def _spine(bone: np.ndarray, step: np.ndarray, place: Place) -> np.ndarray | None:
-    """Return the middle (3,) of the spine, from the kidney's [mm], by a mask of cells; None without a
-    bone.
-    """
+    """The middle (3,) of the spine, from the kidney's [mm], by a mask of cells; None without a bone."""
     middle = spine_middle(bone)
     return None if middle is None else place.of_indices((middle[None] + 0.5) * step - 0.5)[0]
 
 
 def _middle(cells: np.ndarray, step: np.ndarray, first: list[int]) -> np.ndarray:
-    """Return the index (1, 3) of the voxel, fractional, in the middle of a mask of cells, in a box whose
-    first cell is given.
+    """The index (1, 3) of the voxel, fractional, in the middle of a mask of cells, in a box whose first cell
+    is given.
     """
     return ((np.argwhere(cells) + first).mean(axis=0)[None] + 0.5) * step - 0.5
 
@@ -207,9 +205,7 @@ def _middle(cells: np.ndarray, step: np.ndarray, first: list[int]) -> np.ndarray
 def _body(
     level_hu: float, radius_mm: float, at: np.ndarray, spine: np.ndarray | None, is_enhanced: bool
 ) -> str:
-    """Return the tissue of a body of soft tissue by its HU, the ball in it, and its place from the kidney
-    [mm].
-    """
+    """The tissue of a body of soft tissue by its HU, the ball in it, and its place from the kidney [mm]."""
     if level_hu < _fluid_hu(is_enhanced)[1]:
         return "soft-tissue"
     beside_spine = spine is not None and abs(at[0] - spine[0]) < BESIDE_SPINE_MM and at[1] > spine[1] - 25.0

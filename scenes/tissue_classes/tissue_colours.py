@@ -34,7 +34,7 @@ COLOURS = {
 
 
 def rgb_of(tissue: str) -> tuple[float, float, float]:
-    """Return red, green and blue of a tissue, 0 to 1."""
+    """Red, green and blue of a tissue, 0 to 1."""
     digits = COLOURS[tissue]
     red, green, blue = (int(digits[n : n + 2], 16) / 255 for n in (1, 3, 5))
     return red, green, blue

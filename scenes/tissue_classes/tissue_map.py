@@ -79,7 +79,7 @@ class TissueMap:
     index_from_mm: np.ndarray
 
     def mask(self, *tissues: str) -> np.ndarray:
-        """Return whether a voxel is of one of some tissues."""
+        """Whether a voxel is of one of some tissues."""
         return of_tissues(self.codes, *tissues)
 
     @property
@@ -100,7 +100,7 @@ class KidneyShape:
 
     @classmethod
     def of(cls, organ: trimesh.Trimesh, index_from_mm: np.ndarray, shape: tuple[int, ...]) -> "KidneyShape":
-        """Return that of a surface [mm] on a grid."""
+        """That of a surface [mm] on a grid."""
         grid = SurfaceGrid(organ, MARGIN_MM)
         box = surface_box(organ, index_from_mm, shape, MARGIN_MM)
         both = grid.distance, _outer_distance(grid.distance)
@@ -124,14 +124,10 @@ def tissue_map(
     index_from_mm: np.ndarray,
     draws: bool = True,
 ) -> TissueMap:
-    """Return the tissue of each voxel of a CT around a kidney.
+    """The tissue of each voxel of a CT ``hu`` (nx, ny, nz) [HU] around a kidney.
 
-    Args:
-        hu: (nx, ny, nz) [HU].
-        labels: on the same grid, codes of TISSUES (``codes_of_labels``); 0 without.
-        organ: its surface [mm].
-        index_from_mm: (4, 4), from patient coordinates, LPS.
-        draws: also what no CT shows.
+    ``labels`` are codes of TISSUES on the same grid (``codes_of_labels``), 0 without; ``organ`` is a surface
+    [mm]; ``index_from_mm`` (4, 4) is from patient coordinates, LPS. With ``draws`` also what no CT shows.
     """
     spacing = np.linalg.norm(np.linalg.inv(index_from_mm[:3, :3]), axis=0)
     factors = fine_factors(spacing)
@@ -171,8 +167,8 @@ def tissue_map(
 def dense_pieces_of_kidney(
     hu: np.ndarray, labels: np.ndarray, organ: trimesh.Trimesh, index_from_mm: np.ndarray
 ) -> tuple[DensePieces, np.ndarray]:
-    """Return the dense pieces that ``tissue_map`` finds in the same CT, and the transform (4, 4) from mm
-    to their indices.
+    """The dense pieces that ``tissue_map`` finds in the same CT, and the transform (4, 4) from mm to their
+    indices.
     """
     spacing = np.linalg.norm(np.linalg.inv(index_from_mm[:3, :3]), axis=0)
     factors = fine_factors(spacing)
@@ -182,17 +178,17 @@ def dense_pieces_of_kidney(
     box = shape.box
     _, artery = _bones_and_arteries(hu, labels, index_from_mm)
     artery = refined(artery, factors) > 0.5
-    found = _dense(
+    pieces = _dense(
         refined(hu, factors)[box], own[box], artery[box], shape, float(np.prod(spacing / factors)) / 1000
     )
     # Stones, and other labels than the whole kidney's, are written over contrast agent.
-    shown = replace(found, urine=found.urine & ~found.stone & np.isin(own[box], [0, CODE["kidney"]]))
+    shown = replace(pieces, urine=pieces.urine & ~pieces.stone & np.isin(own[box], [0, CODE["kidney"]]))
     to_index[:3, 3] -= [a.start for a in box]
     return shown, to_index
 
 
 def codes_of_labels(labels: np.ndarray, tissues: Mapping[int, str]) -> np.ndarray:
-    """Return labels as codes of TISSUES, uint8, 0 where a label has no tissue."""
+    """Labels as codes of TISSUES, uint8, 0 where a label has no tissue."""
     table = np.zeros(max(int(labels.max()), *tissues, 0) + 1, np.uint8)
     for value, tissue in tissues.items():
         table[value] = CODE[tissue]
@@ -200,12 +196,12 @@ def codes_of_labels(labels: np.ndarray, tissues: Mapping[int, str]) -> np.ndarra
 
 
 def of_tissues(codes: np.ndarray, *tissues: str) -> np.ndarray:
-    """Return whether codes are of one of some tissues."""
+    """Whether codes are of one of some tissues."""
     return np.isin(codes, [CODE[name] for name in tissues])
 
 
 def _median(hu: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return the median of each voxel and its neighbours: noise goes, edges stay.
+    """The median of each voxel and its neighbours: noise goes, edges stay.
 
     Thick slices are not mixed.
     """
@@ -215,8 +211,8 @@ def _median(hu: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
 
 
 def _outer_distance(distance_mm: np.ndarray) -> np.ndarray:
-    """Return distances [mm] from a surface whose hollows are filled, on the grid of a SurfaceGrid: closing
-    by a ball.
+    """Distances [mm] from a surface whose hollows are filled, on the grid of a SurfaceGrid: closing by a
+    ball.
     """
     near = distance_mm <= CONCAVITY_MM
     # From the middles of points: half of their distance is not known.
@@ -227,9 +223,7 @@ def _outer_distance(distance_mm: np.ndarray) -> np.ndarray:
 def _bones_and_arteries(
     hu: np.ndarray, labels: np.ndarray, index_from_mm: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return masks of bones, and of the aorta with its branches where these are as bright: in the arterial
-    phase.
-    """
+    """Masks of bones, and of the aorta with its branches where these are as bright: in the arterial phase."""
     mm_from_index = np.linalg.inv(index_from_mm)
     spacing = np.linalg.norm(mm_from_index[:3, :3], axis=0)
     bone = bones(hu, spacing)
@@ -246,14 +240,14 @@ def _bones_and_arteries(
 def _dense(
     hu: np.ndarray, own: np.ndarray, artery: np.ndarray, shape: KidneyShape, voxel_ml: float
 ) -> DensePieces:
-    """Return the dense pieces in what is not labelled, or labelled as parenchyma or sinus, and no artery."""
+    """The dense pieces in what is not labelled, or labelled as parenchyma or sinus, and no artery."""
     unlabelled = ((own == 0) & ~artery) | of_tissues(own, *PARENCHYMA, "sinus")
     parenchyma = shape.inside & ((own == 0) | of_tissues(own, *PARENCHYMA))
     hidden = np.where(unlabelled, hu, -FAR_MM)
     # Beside labelled contrast agent, voxels are as bright by partial volume.
     beside = ndimage.maximum_filter(own == CODE["urine"], 3)
-    found = dense_pieces(hidden, parenchyma, shape.inside | shape.hollow, voxel_ml)
-    return DensePieces(found.urine, found.stone & ~(beside & found.is_enhanced), found.is_enhanced)
+    pieces = dense_pieces(hidden, parenchyma, shape.inside | shape.hollow, voxel_ml)
+    return DensePieces(pieces.urine, pieces.stone & ~(beside & pieces.is_enhanced), pieces.is_enhanced)
 
 
 def _draw(codes: np.ndarray, kidney: np.ndarray, shape: KidneyShape, spacing_mm: np.ndarray) -> np.ndarray:
@@ -286,5 +280,5 @@ def _write_labels(codes: np.ndarray, own: np.ndarray, hu: np.ndarray, spacing_mm
 def tissue_arrays(
     hu: np.ndarray, labels: np.ndarray, organ: trimesh.Trimesh, index_from_mm: np.ndarray, draws: int
 ) -> tuple[np.ndarray, ...]:
-    """Return the arrays of ``tissue_map``, for a cache."""
+    """The arrays of ``tissue_map``, for a cache."""
     return tissue_map(hu, labels, organ, index_from_mm, bool(draws)).arrays

@@ -22,12 +22,10 @@ THIN_ABOVE_HU, AGENT_ABOVE_HU = 140.0, 260.0
 
 
 def arterial_aorta(hu: np.ndarray, mm_from_index: np.ndarray, spine_mm: np.ndarray) -> np.ndarray:
-    """Return a mask (nx, ny, nz) of the aorta in the arterial phase; empty in other phases.
+    """A mask (nx, ny, nz) of the aorta in the arterial phase; empty in other phases.
 
-    Args:
-        hu: of the CT.
-        mm_from_index: (4, 4), to patient coordinates, LPS.
-        spine_mm: the spine's middle (3,).
+    ``hu`` are of the CT; ``mm_from_index`` (4, 4) is to patient coordinates, LPS, in which ``spine_mm`` (3,)
+    is the spine's middle.
     """
     spacing = np.linalg.norm(mm_from_index[:3, :3], axis=0)
     bright, step = hu > ARTERIAL_ABOVE_HU, cell_voxels(spacing)
@@ -53,9 +51,7 @@ def arterial_aorta(hu: np.ndarray, mm_from_index: np.ndarray, spine_mm: np.ndarr
 
 
 def with_branches(hu: np.ndarray, aorta: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return an aorta with what is connected to it, nearly as bright, and nothing of the others: bone and
-    kidney.
-    """
+    """An aorta with what is connected to it, nearly as bright, and nothing of the others: bone and kidney."""
     if not aorta.any():
         return aorta
     bright = aorta | ((hu > BRANCH_SHARE * np.median(hu[aorta])) & ~others)
@@ -64,7 +60,7 @@ def with_branches(hu: np.ndarray, aorta: np.ndarray, others: np.ndarray) -> np.n
 
 
 def blood(hu: np.ndarray, organ: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return what has the HU of enhanced blood (nx, ny, nz). ``organ`` is the mask of liver or spleen."""
+    """What has the HU of enhanced blood (nx, ny, nz). ``organ`` is the mask of liver or spleen."""
     width = np.maximum(np.rint(AVERAGED_MM / spacing_mm), 1).astype(int)
     mean = ndimage.uniform_filter(np.asarray(hu, np.float32), (width // 2 * 2 + 1).tolist())
     wide = mean > BLOOD_ABOVE_HU

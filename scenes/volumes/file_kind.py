@@ -37,9 +37,9 @@ def check_kind(path: Path) -> None:
     kind = next((kind for kind, at, mark in MARKS if content[at:].startswith(mark)), None)
     if not start or (kind in (None, expected) and is_compressed == is_named_gzip):
         return
-    found = kind or "no known volume"
+    actual = kind or "no known volume"
     if is_compressed != is_named_gzip:
-        found += f", {'' if is_compressed else 'not '}compressed by gzip"
+        actual += f", {'' if is_compressed else 'not '}compressed by gzip"
     if kind is None:
         advice = "copy or export it again"
     elif is_compressed and kind != "NIfTI":
@@ -47,7 +47,7 @@ def check_kind(path: Path) -> None:
     else:
         advice = f"rename it to end in {ENDINGS_OF[kind][0]}{'.gz' * is_compressed}"
     raise PatientError(
-        f"{path}: is {found}; expected {expected}{' compressed by gzip' * is_named_gzip} by its name; "
+        f"{path}: is {actual}; expected {expected}{' compressed by gzip' * is_named_gzip} by its name; "
         f"{advice}"
     )
 

@@ -32,8 +32,8 @@ def itk_volume(path: Path, vectors: bool = False, space: Space | None = None) ->
     """Read the header of an NRRD or MetaImage file; voxels (z, y, x), of vectors (z, y, x, n), are read on
     demand.
 
-    ``space`` is that of a file that names none. Raises PatientError: damaged, not 3D, of several numbers per
-    voxel but for ``vectors``, without a place in the patient.
+    ``space`` is that of a file that names none. Raises PatientError where it is damaged, not 3D, of several
+    numbers per voxel but for ``vectors``, or without a place in the patient.
     """
     data_file = file_with_voxels(path)
     _check_space(path)
@@ -106,16 +106,17 @@ def _itk_box(path: Path, data_file: Path, box: Box) -> np.ndarray:
 def file_with_voxels(path: Path) -> Path:
     """The file that holds the voxels of a header: the same, or one in its folder.
 
-    Raises PatientError: elsewhere, several files, or a MetaImage that is not 3D, which makes ITK crash.
+    Raises PatientError where it is elsewhere or in several files, or a MetaImage is not 3D, which makes ITK
+    crash.
     """
     fields = list(_header_fields(path))
     names = [value for key, value in fields if key in ("datafile", "elementdatafile")]
     if path.suffix.lower() in META:
         dimensions = [value for key, value in fields if key == "ndims"]
         if len(names) != 1 or dimensions != ["3"]:
-            found = " and ".join(dimensions)[:20] or "no"
+            count = " and ".join(dimensions)[:20] or "no"
             raise PatientError(
-                f"{path}: its header has {found} dimensions; expected one 3D volume and one file with its "
+                f"{path}: its header has {count} dimensions; expected one 3D volume and one file with its "
                 "voxels; export one volume"
             )
     if not names or names in (["LOCAL"], ["local"]):

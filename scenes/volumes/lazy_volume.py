@@ -51,7 +51,9 @@ class LazyVolume:
         )
 
     def read(self, box: Box | None = None) -> np.ndarray:
-        """Voxels (z, y, x) of a box, or all. Raises PatientError: more than fit in memory, or not finite."""
+        """Voxels (z, y, x) of a box, or all. Raises PatientError where they do not fit in memory, or are not
+        finite.
+        """
         box = box or self.grid.full_box()
         needed = VOXEL_BYTES * float(np.prod([float(a.stop - a.start) for a in box]))
         free = psutil.virtual_memory().available

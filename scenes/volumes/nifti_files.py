@@ -30,7 +30,7 @@ def nifti_volume(path: Path, space: Space | None = None) -> LazyVolume:
     """Read the header of a volume; voxels are read on demand. ``space`` is that of a file without an
     orientation.
 
-    Raises PatientError: damaged, not 3D, sheared, no orientation.
+    Raises PatientError where it is damaged, not 3D, sheared, or without an orientation.
     """
     with parsing(f"{path}: cannot be read as NIfTI", "expected a whole file; copy or export it again"):
         image: Any = nibabel.load(path, keep_file_open=True)
@@ -63,14 +63,14 @@ def _label_names(header: Any) -> dict[str, str]:
     """Names of label values from the header extension of Connectome Workbench, which TotalSegmentator
     writes.
     """
-    found: dict[str, str] = {}
+    names: dict[str, str] = {}
     with contextlib.suppress(Exception):  # a damaged extension has no names
         for extension in header.extensions:
             text = extension.get_content()
             plain = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
             for key, name in LABEL_ENTRY.findall(plain[:MOST_NAMES_BYTES]):
-                found[key] = name.strip()
-    return found
+                names[key] = name.strip()
+    return names
 
 
 def _narrow(voxels: np.ndarray) -> np.ndarray:

@@ -21,16 +21,12 @@ def is_volume_file(path: Path) -> bool:
 
 
 def file_volume(path: Path, vectors: bool = False, space: Space | None = None) -> LazyVolume:
-    """Read the header of a volume file; voxels are read on demand.
+    """Read the header of a NIfTI, NRRD or MetaImage file; voxels are read on demand.
 
-    Args:
-        path: NIfTI, NRRD or MetaImage.
-        vectors: whether an NRRD or MetaImage may have several numbers per voxel: the layers of a
-        segmentation. space: of the axes of a file that does not name it; a file's own counts before it.
-
-    Raises:
-        PatientError: of another format than its name says, damaged, not 3D, sheared, or without an
-        orientation where no ``space`` is given.
+    With ``vectors`` an NRRD or MetaImage may have several numbers per voxel: the layers of a segmentation.
+    ``space`` is that of the axes of a file that does not name it; a file's own counts before it. Raises
+    PatientError where the file is of another format than its name says, damaged, not 3D, sheared, or without
+    an orientation where there is no ``space``.
     """
     check_kind(path)
     if not path.name.lower().endswith(NIFTI):

@@ -103,8 +103,8 @@ class VoxelGrid:
 
     def share_inside(self, places: npt.ArrayLike) -> float:
         """Share of places (n, 3) in LPS [mm] that are in a voxel of this grid."""
-        found = self.index(places)
-        return float(((found >= -0.5) & (found <= np.array(self.size) - 0.5)).all(axis=1).mean())
+        indices = self.index(places)
+        return float(((indices >= -0.5) & (indices <= np.array(self.size) - 0.5)).all(axis=1).mean())
 
     def corners(self, box: Box | None = None) -> np.ndarray:
         """LPS [mm] of the eight outermost voxel centres (8, 3) of the grid or of a box."""
@@ -131,9 +131,9 @@ class VoxelGrid:
     def box_around(self, low: np.ndarray, high: np.ndarray) -> Box:
         """The smallest box of voxels that covers an LPS box [mm] between two corners; it may be empty."""
         corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(3, -1).T
-        found = self.index(corners)
-        first = np.clip(np.floor(found.min(axis=0)), 0, self.size)
-        last = np.clip(np.ceil(found.max(axis=0)) + 1, 0, self.size)
+        indices = self.index(corners)
+        first = np.clip(np.floor(indices.min(axis=0)), 0, self.size)
+        last = np.clip(np.ceil(indices.max(axis=0)) + 1, 0, self.size)
         x, y, z = (slice(int(a), int(max(a, b))) for a, b in zip(first, last, strict=True))
         return x, y, z
 
@@ -152,7 +152,7 @@ class VoxelGrid:
 
     def sampled(self, image: sitk.Image, interpolator: int, beyond: float) -> np.ndarray:
         """An image resampled at these voxels (z, y, x); ``beyond`` outside the image."""
-        found = sitk.Resample(
+        resampled = sitk.Resample(
             image,
             list(self.size),
             sitk.Transform(),
@@ -162,7 +162,7 @@ class VoxelGrid:
             self.direction.ravel().tolist(),
             beyond,
         )
-        return sitk.GetArrayFromImage(found)
+        return sitk.GetArrayFromImage(resampled)
 
     def same_as(self, other: VoxelGrid) -> bool:
         """Whether the sizes are equal and the corners agree to 0.01 voxel; files round their geometry."""

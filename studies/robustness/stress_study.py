@@ -223,7 +223,7 @@ def _free_shape_error(specimen: Specimen) -> float:
     """
     state = specimen.solver.snapshot()
     up = (state.body.position + LIFT_MM * specimen.up).astype(np.float32)
-    specimen.solver.restore(SolverState(BodyState(up, np.zeros_like(up)), state.history))
+    specimen.solver.restore(SolverState(BodyState(up, np.zeros_like(up)), state.internal_state))
     specimen.solver.contacts.reset()
     weightless = replace(specimen.settings, gravity=(0.0, 0.0, 0.0))
     error = np.inf

@@ -46,7 +46,7 @@ def patient() -> Patient:
     (labelled,) = assign_tissues([LabelMap.of(drawn(labels, *solids))], ["2", "5"], words)
     with pytest.MonkeyPatch.context() as patch:
         coarsely(patch)
-        return import_patient(LazyVolume.of(ct), labelled, [2, 5], margin_mm=20.0, given=words)
+        return import_patient(LazyVolume.of(ct), labelled, [2, 5], margin_mm=20.0, assigned=words)
 
 
 @pytest.fixture(scope="module")

@@ -73,7 +73,7 @@ def test_what_is_no_state_of_this_body_is_refused(monkeypatch):
     whole = base64.b64decode(text)
     arrays = dict(np.load(io.BytesIO(whole)))
     hostile = ["", "no state", text[:-40], packed(), packed(**arrays | {"pose": np.full((4, 4), np.nan)})]
-    # The history's shapes are those of a tissue model, which a timeline compares.
+    # The internal variables' shapes are those of a tissue model, which a timeline compares.
     for name, array in arrays.items():
         if ".contacts." in name:
             continue

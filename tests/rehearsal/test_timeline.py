@@ -245,6 +245,6 @@ def test_each_second_has_a_digest_and_each_way_back():
 def test_a_state_of_another_body_is_refused():
     timeline = fake_timeline()
     other = timeline.whole_state()
-    other.organ.solver.history["plane"] = np.zeros((3, 4), np.float32)
+    other.organ.solver.internal_state["plane"] = np.zeros((3, 4), np.float32)
     timeline.submit(Load(state=other, number=7))
     assert timeline.newest().notices == ["a state of another body, or a damaged one"] and timeline.number == 0

@@ -68,7 +68,7 @@ def test_what_a_part_leaves_out_is_typical_of_it():
 
 def test_a_scene_without_parts_is_uniform(device):
     organ = PressedOrgan(case_of(scene_with(), patient()))
-    assert not organ.model.has_parts and organ.model.history == {} and not organ.model.has_capsule
+    assert not organ.model.has_parts and organ.model.internal_state == {} and not organ.model.has_capsule
 
 
 def test_parts_capsule_and_relaxation_reach_the_solver_and_the_state_at_rest(device):
@@ -80,8 +80,8 @@ def test_parts_capsule_and_relaxation_reach_the_solver_and_the_state_at_rest(dev
     assert model.has_parts and model.has_capsule and model.has_relaxation
     assert model.parts == (Material(60.0, 0.45, 1.05),)
     organ.settle()
-    assert set(organ.snapshot().solver.history) >= {"elastic_stress", "overstress"}
-    assert np.abs(organ.snapshot().solver.history["overstress"]).max() == 0
+    assert set(organ.snapshot().solver.internal_state) >= {"elastic_stress", "overstress"}
+    assert np.abs(organ.snapshot().solver.internal_state["overstress"]).max() == 0
     keys = [
         tuple(
             repr(each)

@@ -54,7 +54,7 @@ def label_map(labels, organ=(), **tissues):
 
 def imported(ct, labels, organ=(), side=None, margin_mm=60.0, **tissues):
     labelled = label_map(labels, organ, **tissues)
-    return import_patient(LazyVolume.of(ct), *labelled, side, margin_mm, given=tissues)
+    return import_patient(LazyVolume.of(ct), *labelled, side, margin_mm, assigned=tissues)
 
 
 def found(ct, labels, organ=(), side=None, **tissues):

@@ -75,7 +75,7 @@ def test_a_block_sticks_below_the_friction_angle_and_slides_above(kept, block, f
     solver = kept(on_plane, block)
     solver.contacts.coefficient = friction
     built = solver.snapshot()
-    assert "stick" in built.history
+    assert "stick" in built.internal_state
     # Depths are pressure * PENALTY_DEPTH_MM / E; a point's height is a sum over 8 nodes, each known to an
     # ulp.
     tolerance = 8 * ULP_MM / layer_depth(solver, G)
@@ -112,7 +112,7 @@ def test_a_block_at_rest_has_an_even_contact_pressure(one_device, block):
     # Without friction it widens evenly, and each column of it is carried by the pressure below; the corners'
     # few points also carry what hangs over.
     assert depth < solver.contacts.measure_penetration() < 1.5 * depth
-    assert not hasattr(solver.contacts, "slip") and "stick" not in solver.snapshot().history
+    assert not hasattr(solver.contacts, "slip") and "stick" not in solver.snapshot().internal_state
 
 
 def test_a_shape_out_of_reach_exerts_no_force(one_device, block):
@@ -302,7 +302,7 @@ def test_a_restored_state_continues_with_the_same_bits(kept, dome):
     tilted = settings_of(8, (0.2 * G, 0.0, -G))
     press(solver, 2.0, tilted, 20)
     state = solver.snapshot()
-    assert np.abs(state.history["stick"]).max() > 1e-3
+    assert np.abs(state.internal_state["stick"]).max() > 1e-3
     ends = []
     for forgets in (False, False, True):
         solver.restore(state)

@@ -102,8 +102,8 @@ def test_a_loaded_bar_creeps_as_the_standard_linear_solid(one_device, term):
 
 
 def test_fast_deformation_is_resisted_by_the_sum_of_all_stiffnesses(one_device):
-    """Force and Hessian without a history are those of elastic tissue times 1 + sum gamma (1 - exp(-x)) /
-    x, x = dt / tau.
+    """Force and Hessian without internal variables are those of elastic tissue times 1 + sum gamma (1 -
+    exp(-x)) / x, x = dt / tau.
     """
     lattice = fill_block(BAR, CELL)
     found = []
@@ -118,7 +118,7 @@ def test_fast_deformation_is_resisted_by_the_sum_of_all_stiffnesses(one_device):
         assert relaxing == pytest.approx(factor * elastic, rel=1e-4, abs=1e-5 * np.abs(elastic).max())
 
 
-def test_the_history_belongs_to_the_state(one_device):
+def test_the_internal_variables_belong_to_the_state(one_device):
     lattice = fill_block(BAR, CELL)
     fixed = lattice.nodes[:, 2] < 1e-6
     solver = Solver(NeoHookean(Body(lattice.nodes), lattice, None, MATERIAL, fixed=fixed, prony=TERMS))
@@ -126,7 +126,7 @@ def test_the_history_belongs_to_the_state(one_device):
     for _ in range(20):
         solver.step(settings)
     state = solver.snapshot()
-    assert {"elastic_stress", "overstress"} <= state.history.keys()
+    assert {"elastic_stress", "overstress"} <= state.internal_state.keys()
     ends = []
     for _ in range(2):
         solver.restore(state)
@@ -134,12 +134,12 @@ def test_the_history_belongs_to_the_state(one_device):
             solver.step(settings)
         ends.append(solver.snapshot())
     assert (ends[0].body.position == ends[1].body.position).all()
-    assert (ends[0].history["overstress"] == ends[1].history["overstress"]).all()
+    assert (ends[0].internal_state["overstress"] == ends[1].internal_state["overstress"]).all()
     solver.restart()
-    assert np.abs(solver.snapshot().history["overstress"]).max() == 0
+    assert np.abs(solver.snapshot().internal_state["overstress"]).max() == 0
 
 
-def test_tissue_without_terms_has_no_history(one_device):
+def test_tissue_without_terms_has_no_internal_variables(one_device):
     lattice = fill_block(BAR, CELL)
     solver = Solver(NeoHookean(Body(lattice.nodes), lattice))
-    assert solver.snapshot().history == {} and not hasattr(solver.model, "relaxation")
+    assert solver.snapshot().internal_state == {} and not hasattr(solver.model, "relaxation")

@@ -38,19 +38,16 @@ def fill_plane(
     wall: np.ndarray | None = None,
     is_exclusive: bool = False,
 ) -> FilledPlane:
-    """The pixels inside the contours of a plane, or on one of them.
+    """The pixels of a plane of ``shape`` (rows, columns) that are inside contours, or on one of them.
 
-    By the even-odd rule, but for contours that cross: these are strokes of one body. Contours that share an
-    edge leave no slit between them, and neither does the channel from a contour to its hole (keyhole).
+    By the even-odd rule, but for contours that cross: these are strokes of one body, unless ``is_exclusive``.
+    Contours that share an edge leave no slit between them, and neither does the channel from a contour to its
+    hole (keyhole).
 
-    Args:
-        contours: corners (n, 2) of each: rows and columns [pixels].
-        shape: rows and columns.
-        wall: the least width (rows, columns) [pixels] of the walls of a solid: what is nowhere as wide
-        between two contours,
-            or small beside what they share, is no wall but one contour drawn twice, and the larger one
-            counts. None: any region.
-        is_exclusive: whether contours that cross are exclusive, too.
+    ``contours`` are the corners (n, 2) of each: rows and columns [pixels]. ``wall`` (rows, columns) is the
+    least width [pixels] of the walls of a solid: what is nowhere as wide between two contours, or small
+    beside what they share, is no wall but one contour drawn twice, and the larger one counts. None: any
+    region.
     """
     rounds = [_first_round(corners) for corners in contours]
     kept, differing = _without_copies(rounds, None if is_exclusive else wall)

@@ -99,16 +99,11 @@ def stack_contours(
 
     Nested contours on one plane alternate between inside and outside; contours that cross are united; a
     contour that stands there twice counts once. An organ that has no pixel gets those nearest to its
-    contours, with a warning.
+    contours, with a warning. Nothing is filled outside the box of voxels ``near``; None: all is filled.
+    ``progress`` shows the progress of the planes.
 
-    Args:
-        region: its contours; of an organ, gaps that are too wide to interpolate are refused.
-        ct: the CT's voxels.
-        near: the box of voxels outside which nothing is filled; None: all is filled.
-        progress: shows the progress of the planes.
-
-    Raises:
-        PatientError: far outside the CT, not parallel to its slices, or with a gap that is too wide.
+    Raises PatientError where contours are far outside the CT or not parallel to its slices, or an organ has a
+    gap that is too wide to interpolate.
     """
     places = [ct.index(corners) for corners in region.contours]
     _check_places(str(region), places, ct)
@@ -296,13 +291,10 @@ def _continues(region: DrawnRegion, drawn: _Planes) -> tuple[list[bool], tuple[s
 
 
 def _is_end(section: float, areas: np.ndarray, usual_mm: float) -> bool:
-    """Whether a section [mm^2] may be the last of a body: the cap beyond it, of a ball with the largest
-    section, is little higher than usual.
+    """Whether a section [mm^2] beside a gap may be the last of a body: the cap beyond it, of a ball with the
+    largest section, is little higher than usual.
 
-    Args:
-        section: the one beside a gap.
-        areas: of all sections on its side.
-        usual_mm: the usual distance of planes.
+    ``areas`` are of all sections on its side; ``usual_mm`` is the usual distance of planes.
     """
     cap = np.sqrt(areas.max() / np.pi) - np.sqrt((areas.max() - section) / np.pi)
     return bool(cap <= LACKS * usual_mm)

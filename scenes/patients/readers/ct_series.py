@@ -78,16 +78,16 @@ class CtListing:
 def list_ct(path: Path, progress: Progress = silent, space: Space | None = None) -> CtListing:
     """The CT series and DICOM labels of a path as for ``open_ct``, from their headers.
 
-    A path with labels but without a CT has no series. Raises PatientError: not readable, or neither CT nor
-    labels.
+    A path with labels but without a CT has no series. Raises PatientError where the path cannot be read, or
+    has neither CT nor labels.
     """
     if not path.exists():
         raise PatientError(f"{path}: no such file or folder; check the path")
     if path.is_file() and is_volume_file(path):
         return CtListing([_row_of_file(file_volume(path, space=space))], [])
-    found, volumes = read_dicom_headers(path, progress), volume_files(path)
-    files = [_row_of_file(only_volume(path, volumes, space))] if volumes and not found.candidates else []
-    candidates = in_order(found.candidates if found.labels or files else ct_candidates(path, found))
+    contents, volumes = read_dicom_headers(path, progress), volume_files(path)
+    files = [_row_of_file(only_volume(path, volumes, space))] if volumes and not contents.candidates else []
+    candidates = in_order(contents.candidates if contents.labels or files else ct_candidates(path, contents))
     patients = patient_numbers(candidates)
     numbers = [s.number for s in candidates]
     rows = [
@@ -96,8 +96,8 @@ def list_ct(path: Path, progress: Progress = silent, space: Space | None = None)
     ]
     return CtListing(
         files + rows,
-        [_row_of_labels(kind, item, candidates, patients) for kind, item in found.labels],
-        len(found.unreadable),
+        [_row_of_labels(kind, item, candidates, patients) for kind, item in contents.labels],
+        len(contents.unreadable),
     )
 
 
@@ -107,25 +107,19 @@ def open_ct(
     labels: DicomReferences = NO_REFERENCES,
     grid: VoxelGrid | None = None,
     progress: Progress = silent,
-    found: DicomContents | None = None,
+    contents: DicomContents | None = None,
     space: Space | None = None,
 ) -> LazyVolume:
     """Find a CT and read its headers; voxels are read on demand.
 
-    Args:
-        path: a folder with DICOM files, in subfolders too; a DICOMDIR; a zip archive of DICOM files; an
-        enhanced CT;
-            a .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd file, or a folder with one that is not named as
-            labels.
-        series: number or UID (or its end) of one of several series.
-        labels: what the labels refer to; their series is preferred.
-        grid: the labels' own voxels, where they are a label map.
-        progress: shows the progress of headers and slices.
-        found: the headers of the path, where they have been read.
-        space: of the axes of a file that does not name it.
+    ``path`` is a folder with DICOM files, in subfolders too; a DICOMDIR; a zip archive of DICOM files; an
+    enhanced CT; a .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd file, or a folder with one that is not named as
+    labels. ``series`` is the number or UID (or its end) of one of several series. The series that ``labels``
+    refer to is preferred; ``grid`` are the labels' own voxels, where they are a label map. ``contents`` are
+    the headers of the path, where they have been read; ``space`` is that of the axes of a file that does not
+    name it. ``progress`` shows the progress of headers and slices.
 
-    Raises:
-        PatientError: not readable, or not one complete CT.
+    Raises PatientError where the path cannot be read, or is not one complete CT.
     """
     if not path.exists():
         raise PatientError(f"{path}: no such file or folder; check the path")
@@ -133,26 +127,26 @@ def open_ct(
         if series is not None:
             raise PatientError(f"{path}: has no series; leave --series out")
         return file_volume(path, space=space)
-    found, volumes = found or read_dicom_headers(path, progress), volume_files(path)
-    if volumes and not found.candidates:
+    contents, volumes = contents or read_dicom_headers(path, progress), volume_files(path)
+    if volumes and not contents.candidates:
         if series is not None:
             raise PatientError(f"{path}: has no DICOM series; leave --series out")
         return only_volume(path, volumes, space)
-    chosen, notes = choose_series(path, ct_candidates(path, found), series, labels, grid)
-    if found.others:
-        notes.append(f"left out, no CT slices: {', '.join(_counted(found.others))}")
+    chosen, notes = choose_series(path, ct_candidates(path, contents), series, labels, grid)
+    if contents.others:
+        notes.append(f"left out, no CT slices: {', '.join(_counted(contents.others))}")
     if volumes:
         # No names, which may be the patient's.
         notes.append(f"left out, beside the DICOM files: {len(volumes)} NIfTI, NRRD or MHA files")
     # A damaged header may have lost the UID of its series.
-    damaged = [fault for s in found.candidates if s is not chosen and not s.slices for fault in s.faults]
-    if found.unreadable:
+    damaged = [fault for s in contents.candidates if s is not chosen and not s.slices for fault in s.faults]
+    if contents.unreadable:
         notes.append(
-            f"{len(found.unreadable)} subfolders cannot be read, so the series may be incomplete; check "
+            f"{len(contents.unreadable)} subfolders cannot be read, so the series may be incomplete; check "
             "their permissions"
         )
-    with _naming("damaged", damaged), _naming("subfolders that cannot be read", found.unreadable):
-        _check_split(path, chosen, found.candidates)
+    with _naming("damaged", damaged), _naming("subfolders that cannot be read", contents.unreadable):
+        _check_split(path, chosen, contents.candidates)
         volume = _series_volume(path, chosen, progress)
     return replace(volume, notes=(*notes, *volume.notes))
 
@@ -184,9 +178,9 @@ def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
         raise PatientError(
             f"{path}: no DICOM file found; give the folder of the slices, or a NIfTI, NRRD or MHA file"
         )
-    found = read_headers(items, lambda files: progress(files, "headers"))
-    series = {one.uid: one for one in joined(list(found.series.values()))}
-    return replace(found, series=series, unreadable=unreadable)
+    contents = read_headers(items, lambda files: progress(files, "headers"))
+    series = {one.uid: one for one in joined(list(contents.series.values()))}
+    return replace(contents, series=series, unreadable=unreadable)
 
 
 def _below(path: Path, error: OSError) -> str:
@@ -207,12 +201,12 @@ def _check_split(path: Path, series: Series, candidates: list[Series]) -> None:
         )
 
 
-def ct_candidates(path: Path, found: DicomContents) -> list[Series]:
+def ct_candidates(path: Path, contents: DicomContents) -> list[Series]:
     """All series with CT slices, also damaged ones. Raises PatientError where there are none."""
-    if not found.candidates:
-        advice = "give the CT first, then the labels" if found.labels else "give the folder of a CT series"
-        raise PatientError(f"{path}: {_contents_without_ct(found)}; expected a CT; {advice}")
-    return found.candidates
+    if not contents.candidates:
+        advice = "give the CT first, then the labels" if contents.labels else "give the folder of a CT series"
+        raise PatientError(f"{path}: {_contents_without_ct(contents)}; expected a CT; {advice}")
+    return contents.candidates
 
 
 def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume:
@@ -263,7 +257,7 @@ def _series_volume(path: Path, series: Series, progress: Progress) -> LazyVolume
 
 @contextmanager
 def _naming(what: str, left_out: Sequence[str]) -> Iterator[None]:
-    """Adds to an error the files that were left out of a series, which may lack them."""
+    """Add to an error the files that were left out of a series, which may lack them."""
     try:
         yield
     except PatientError as error:
@@ -325,9 +319,9 @@ def _counted(kinds: Counter[str]) -> list[str]:
     return [f"{count} {what}" for what, count in sorted(kinds.items())]
 
 
-def _contents_without_ct(found: DicomContents) -> str:
-    localizers = Counter(localisers=sum(series.localizers for series in found.series.values()))
-    kinds = _counted(found.others) + _counted(Counter(kind for kind, _ in found.labels) + localizers)
+def _contents_without_ct(contents: DicomContents) -> str:
+    localizers = Counter(localisers=sum(series.localizers for series in contents.series.values()))
+    kinds = _counted(contents.others) + _counted(Counter(kind for kind, _ in contents.labels) + localizers)
     return f"no CT slices, but {', '.join(kinds)}" if kinds else "no CT slices"
 
 

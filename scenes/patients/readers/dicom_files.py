@@ -91,8 +91,8 @@ def find_dicom_files(path: Path, unreadable: Callable[[OSError], object] | None 
 
     ``unreadable`` is called for each subfolder that cannot be listed.
 
-    Raises PatientError: too many or too large files, an archive that is damaged, encrypted or has paths
-    outside itself, a DICOMDIR whose files are missing or elsewhere.
+    Raises PatientError where files are too many or too large, an archive is damaged, encrypted or has paths
+    outside itself, or a DICOMDIR's files are missing or elsewhere.
     """
     if path.is_dir():
         items = _of_folder(path, unreadable)
@@ -197,15 +197,15 @@ def _of_archive(path: Path) -> list[SourceFile]:
         with parsing(where, "the archive is damaged; copy it again"), archive.open(entry) as file:
             return io.BytesIO(file.read(most))
 
-    found = [entry for entry in entries if _looks_like_dicom(extracted(entry, START_BYTES).read())]
-    total = sum(entry.file_size for entry in found)
+    dicom_entries = [entry for entry in entries if _looks_like_dicom(extracted(entry, START_BYTES).read())]
+    total = sum(entry.file_size for entry in dicom_entries)
     if total > MOST_ARCHIVE_BYTES:
         raise PatientError(
             f"{path}: extracts to {total / 2**30:.0f} GiB of DICOM; expected at most "
             f"{MOST_ARCHIVE_BYTES / 2**30:.0f}; "
             "give an archive of the CT alone"
         )
-    return [SourceFile(entry.filename, partial(extracted, entry), None) for entry in found]
+    return [SourceFile(entry.filename, partial(extracted, entry), None) for entry in dicom_entries]
 
 
 def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:

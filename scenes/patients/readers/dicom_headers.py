@@ -158,7 +158,7 @@ def read_headers(
     items: list[SourceFile], progress: Callable[[Iterable[SourceFile]], Iterable[SourceFile]] = iter
 ) -> DicomContents:
     """Read all headers and sort them by kind. Raises PatientError where a file is damaged."""
-    found = DicomContents()
+    contents = DicomContents()
     for item in progress(items):
         header = item.header(TAGS)
         with parsing(f"{item.name}: a damaged DICOM file", DAMAGED):
@@ -167,10 +167,10 @@ def read_headers(
             )
             is_directory = header.file_meta.get("MediaStorageSOPClassUID", "") == MEDIA_DIRECTORY
         if sop_class in LABEL_CLASSES:
-            found.labels.append((LABEL_CLASSES[sop_class], item))
+            contents.labels.append((LABEL_CLASSES[sop_class], item))
         elif sop_class in CT_CLASSES:
             named = number if number.isdecimal() else "without a number"
-            series = found.series.setdefault(uid, Series(uid, named, patient, study))
+            series = contents.series.setdefault(uid, Series(uid, named, patient, study))
             series.frame_of_reference = frame
             try:
                 if patient != series.patient:
@@ -185,14 +185,14 @@ def read_headers(
                     series.faults.append(str(error))
         elif sop_class:
             # Free text may name the patient.
-            found.others[modality if MODALITY.fullmatch(modality) else "files of unknown kind"] += 1
+            contents.others[modality if MODALITY.fullmatch(modality) else "files of unknown kind"] += 1
         elif not is_directory and header.preamble is not None:
             raise PatientError(f"{item.name}: a damaged DICOM file (no SOPClassUID); {DAMAGED}")
         elif not is_directory:
-            found.others["files of unknown kind"] += 1
-    for series in found.series.values():
+            contents.others["files of unknown kind"] += 1
+    for series in contents.series.values():
         _leave_out_projections(series)
-    return found
+    return contents
 
 
 def _leave_out_projections(series: Series) -> None:
@@ -267,8 +267,8 @@ def _slice(
     item: SourceFile, frame: int | None, number: int | None, groups: list[Dataset], header: Dataset
 ) -> DicomSlice | None:
     def value(name: str, usual: Any = None) -> Any:
-        found = (_read(item, group, name) for group in groups)
-        return next((one for one in found if one not in (None, "")), usual)
+        values = (_read(item, group, name) for group in groups)
+        return next((one for one in values if one not in (None, "")), usual)
 
     kind = {str(word).upper() for word in [*(value("ImageType") or []), *(value("FrameType") or [])]}
     if kind & LOCALIZERS:
@@ -326,17 +326,17 @@ def _read(item: SourceFile, group: Dataset, name: str) -> Any:
 def _whole(item: SourceFile, header: Dataset, name: str) -> int | None:
     """A whole number, or None. Raises PatientError."""
     with parsing(f"{item.name}: {name} cannot be read", "expected a whole number"):
-        given = header.get(name)
-        return None if given in (None, "") else int(given)
+        value = header.get(name)
+        return None if value in (None, "") else int(value)
 
 
-def _numbers(item: SourceFile, name: str, given: Any, count: int) -> np.ndarray:
-    if given is None:
+def _numbers(item: SourceFile, name: str, value: Any, count: int) -> np.ndarray:
+    if value is None:
         raise PatientError(f"{item.name}: has no {name}")
     expected = f"{count} number{'s' * (count > 1)}, none beyond {MOST:.0f}"
-    several = isinstance(given, Iterable) and not isinstance(given, str)
+    several = isinstance(value, Iterable) and not isinstance(value, str)
     with parsing(f"{item.name}: {name} cannot be read", f"expected {expected}"):
-        numbers = np.array([float(n) for n in (given if several else [given])])
+        numbers = np.array([float(n) for n in (value if several else [value])])
     if numbers.shape != (count,) or not (np.abs(numbers) <= MOST).all():
         raise PatientError(
             f"{item.name}: {name} is {', '.join(f'{n:g}' for n in numbers[: count + 1])}; expected {expected}"
@@ -344,9 +344,9 @@ def _numbers(item: SourceFile, name: str, given: Any, count: int) -> np.ndarray:
     return numbers
 
 
-def _orientation(item: SourceFile, given: Any) -> tuple[np.ndarray, np.ndarray]:
+def _orientation(item: SourceFile, value: Any) -> tuple[np.ndarray, np.ndarray]:
     """Orthonormal vectors along a slice's rows and columns."""
-    both = _numbers(item, "ImageOrientationPatient", given, 6).reshape(2, 3)
+    both = _numbers(item, "ImageOrientationPatient", value, 6).reshape(2, 3)
     lengths = np.linalg.norm(both, axis=1)
     if np.abs(lengths - 1).max() > 0.01 or abs(both[0] @ both[1]) > 0.01:
         raise PatientError(

@@ -35,16 +35,12 @@ ALWAYS = {"SamplesPerPixel": 1, "PhotometricInterpretation": "MONOCHROME2", "Pix
 def read_segmentation(
     item: SourceFile, wanted: Collection[str] = (), progress: Progress = silent
 ) -> Segmentation:
-    """One label map per segment, without those that are needless and not wanted.
+    """The segments of a DICOM segmentation, one label map each, without those that are needless and not
+    wanted.
 
-    Args:
-        item: the file.
-        wanted: names or numbers of segments of the user.
-        progress: shows the progress of the segments.
-
-    Raises:
-        PatientError: damaged, not in the patient's coordinates, or of a transfer syntax that nothing here
-        decodes.
+    ``wanted`` are names or numbers of segments of the user; ``progress`` shows the progress of the segments.
+    Raises PatientError where the file is damaged, not in the patient's coordinates, or of a transfer syntax
+    that nothing here decodes.
     """
     logging.getLogger("highdicom").setLevel(logging.ERROR)
     data = item.parsed()
@@ -74,7 +70,7 @@ def read_segmentation(
         notes=(*notes, *note_of_left_out(left_out)),
         references=references,
         grid=grid,
-        empty=tuple(one for one in kept if all(one not in each.segments.values() for each in maps)),
+        empty=tuple(one for one in kept if all(one not in label_map.segments.values() for label_map in maps)),
     )
 
 
@@ -153,11 +149,8 @@ def _complete(item: SourceFile, data: Dataset) -> None:
 
 
 def _reduce(data: Dataset) -> int:
-    """Leave only what voxels and their places need, so that nothing else has to be there. Segments are
-    described by plain codes.
-
-    Returns:
-        What was added to the numbers of segments, as highdicom's are from 1.
+    """Leave only what voxels and their places need, so that nothing else has to be there; return what was
+    added to the numbers of segments, as highdicom's are from 1. Segments are described by plain codes.
     """
     is_map = data.SegmentationType == "LABELMAP"
     numbers = [int(one.SegmentNumber) for one in data.SegmentSequence]

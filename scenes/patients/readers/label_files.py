@@ -55,19 +55,13 @@ def open_labels(
     belongs: Belongs = lambda references: True,
     space: Space | None = None,
 ) -> Segmentation:
-    """Read labels.
+    """Read the labels of a path: a label map or .seg.nrrd file, a surface, a folder with one file per organ,
+    a DICOM-SEG or RTSTRUCT, or a folder or archive with one of these.
 
-    Args:
-        path: a label map or .seg.nrrd file, a surface, a folder with one file per organ, a DICOM-SEG or
-        RTSTRUCT, or a
-            folder or archive with one of these.
-        wanted: names or values of segments, or files of a folder, to read, whatever their names.
-        progress: shows the progress of headers, files and contours.
-        belongs: selects one of several DICOM labels.
-        space: of the axes of files that do not name it.
-
-    Raises:
-        PatientError: not readable, no labels, or all empty.
+    ``wanted`` are names or values of segments, or files of a folder, to read, whatever their names.
+    ``belongs`` selects one of several DICOM labels; ``space`` is that of the axes of files that do not name
+    it. ``progress`` shows the progress of headers, files and contours. Raises PatientError where the path
+    cannot be read, or has no labels, or all are empty.
     """
     if not path.exists():
         raise PatientError(f"{path}: no such file or folder; check the path")
@@ -86,8 +80,8 @@ def open_labels(
             "choose another"
         )
     contents = read_dicom_headers(path, progress)
-    found = segmentation_of(contents, wanted, progress, belongs)
-    if found is None:
+    segmentation = segmentation_of(contents, wanted, progress, belongs)
+    if segmentation is None:
         slices = sum(len(series.slices) for series in contents.candidates)
         a_ct = f", but {slices} CT slices" if slices else ""
         order = "give the CT first, then the labels" if slices else "choose another"
@@ -95,7 +89,7 @@ def open_labels(
             f"{path}: has no labels{a_ct}; expected a DICOM segmentation or structure set, or label maps; "
             f"{order}"
         )
-    return found
+    return segmentation
 
 
 def _files_of_folder(
@@ -140,8 +134,10 @@ def segmentation_of(
     headers = [label_header(kind, item) for kind, item in contents.labels]
     own = [header for header in headers if belongs(header.references)]
     if len(own) == 1:
-        found = _read_dicom(own[0].kind, own[0].item, wanted, progress)
-        return replace(found, notes=(*found.notes, f"left out, labels of another CT: {len(headers) - 1}"))
+        segmentation = _read_dicom(own[0].kind, own[0].item, wanted, progress)
+        return replace(
+            segmentation, notes=(*segmentation.notes, f"left out, labels of another CT: {len(headers) - 1}")
+        )
     patients = len({header.references.patient or header.study for header in own})
     of_patients = f" of {patients} patients" if patients > 1 else ", none of this CT," if not own else ""
     names = ", ".join(header.item.name for header in (own or headers)[:6])
@@ -198,10 +194,10 @@ def _label_map_file(path: Path, space: Space | None) -> Segmentation:
 
 def _names(volume: LazyVolume) -> dict[tuple[int, int], Segment]:
     """Segments by layer and value, in the header of 3D Slicer or of a NIfTI file."""
-    found = {}
+    segments = {}
     for key, name in volume.metadata.items():
         if key.isdecimal():
-            found[0, int(key)] = Segment.named(name, int(key))
+            segments[0, int(key)] = Segment.named(name, int(key))
         if number := SLICER_KEY.match(key):
             start = f"Segment{number[1]}_"
             rgb = [float(c) for c in re.findall(r"\d+\.?\d*", volume.metadata.get(f"{start}Color", ""))[:3]]
@@ -215,8 +211,8 @@ def _names(volume: LazyVolume) -> dict[tuple[int, int], Segment]:
                 )
             colour = (rgb[0], rgb[1], rgb[2]) if len(rgb) == 3 else None
             codes = slicer_meaning(volume.metadata.get(f"{start}Tags", ""))
-            found[int(layer), int(label)] = Segment.coded(volume.name, name, codes, int(label), colour)
-    return found
+            segments[int(layer), int(label)] = Segment.coded(volume.name, name, codes, int(label), colour)
+    return segments
 
 
 def _file_per_organ(
@@ -257,8 +253,8 @@ def _file_per_organ(
 
 def _near(files: list[Path], wanted: Collection[str]) -> list[Path]:
     """The files whose names are wanted, or not those of structures far from the kidneys."""
-    asked = {word.casefold() for word in wanted}
-    return [file for file in files if _stem(file).casefold() in asked or not is_far(_stem(file))]
+    names = {word.casefold() for word in wanted}
+    return [file for file in files if _stem(file).casefold() in names or not is_far(_stem(file))]
 
 
 def _stem(path: Path) -> str:

@@ -53,16 +53,16 @@ def references_of(data: Dataset) -> DicomReferences:
 
     Of a structure set the frames are those of its regions; what cannot be read counts as absent.
     """
-    found = set(_uids(data, LEADING))
-    if not any(kind == "instances" and uid for kind, uid in found):
-        found |= {(kind, uid) for kind, uid in _uids(data, OF_EACH) if kind == "instances"}
+    uids = set(_uids(data, LEADING))
+    if not any(kind == "instances" and uid for kind, uid in uids):
+        uids |= {(kind, uid) for kind, uid in _uids(data, OF_EACH) if kind == "instances"}
     frames = {
         _text(region, "ReferencedFrameOfReferenceUID") for region in _items(data, "StructureSetROISequence")
     }
-    frames = frames - {""} or {uid for kind, uid in found if kind == "frames"}
+    frames = frames - {""} or {uid for kind, uid in uids if kind == "frames"}
 
     def of(kind: str) -> frozenset[str]:
-        return frozenset(uid for one, uid in found if one == kind and uid)
+        return frozenset(uid for one, uid in uids if one == kind and uid)
 
     return DicomReferences(frozenset(frames - {""}), of("series"), of("instances"), _text(data, "PatientID"))
 

@@ -106,8 +106,8 @@ class LabelMap:
     @classmethod
     def valued(cls, grid: VoxelGrid, values: np.ndarray, names: Mapping[int, str] | None = None) -> LabelMap:
         """A label map of voxel values, with names where they are known."""
-        found = {v: Segment.named((names or {}).get(v, ""), v) for v in present_values(values)}
-        return cls(grid, values, found)
+        segments = {v: Segment.named((names or {}).get(v, ""), v) for v in present_values(values)}
+        return cls(grid, values, segments)
 
     @classmethod
     def single(cls, grid: VoxelGrid, inside: np.ndarray, segment: Segment) -> LabelMap:
@@ -188,10 +188,10 @@ def among(voxels: np.ndarray, wanted: Sequence[int]) -> np.ndarray:
     """Whether each voxel has one of the wanted values; plane by plane, as np.isin takes three times the
     memory.
     """
-    found = np.empty(voxels.shape, bool)
-    for plane, inside in zip(voxels, found, strict=True):
+    mask = np.empty(voxels.shape, bool)
+    for plane, inside in zip(voxels, mask, strict=True):
         inside[:] = np.isin(plane, wanted)
-    return found
+    return mask
 
 
 def box_of(inside: np.ndarray) -> Box:

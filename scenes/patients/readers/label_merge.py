@@ -19,16 +19,11 @@ MERGE_ORDER = (
 
 
 def merge_label_maps(maps: list[LabelMap], organ: Sequence[str] = ()) -> tuple[LabelMap, list[int] | None]:
-    """Merge maps that may overlap and have different grids, on the grid of the first with a kidney, extended
-    to cover all.
+    """One map of one or more, which may overlap and have different grids, on the grid of the first with a
+    kidney, extended to cover all; and the values of the named organ, None where none is named.
 
-    Args:
-        maps: one or more.
-        organ: names or values of the segments that the user gave as the organ: they are the organ alone,
-        whatever covers them.
-
-    Returns:
-        The merged map, and the values of the named organ; None where none is named.
+    ``organ`` has names or values of the segments that the user named as the organ: they are the organ alone,
+    whatever covers them.
     """
     if len(maps) == 1:
         return maps[0], maps[0].values_of(organ) if organ else None

@@ -38,15 +38,8 @@ def read_structures(
     """The regions of a structure set, which are filled once the CT's grid is known.
 
     Outlines of the body, couches and structures far from the kidneys are left out, except where they are
-    wanted.
-
-    Args:
-        item: the file.
-        wanted: names or numbers of regions of the user.
-        progress: shows the progress of the contours.
-
-    Raises:
-        PatientError: damaged, or regions in several frames of reference.
+    ``wanted``: names or numbers of regions of the user. ``progress`` shows the progress of the contours.
+    Raises PatientError where the file is damaged, or has regions in several frames of reference.
     """
     data = item.parsed()
     with parsing(f"{item.name}: cannot be read as an RTSTRUCT", "export it again"):
@@ -126,10 +119,10 @@ def _filled_regions(regions: list[DrawnRegion], ct: VoxelGrid, progress: Progres
 
 
 def _colour(roi: Dataset) -> tuple[float, float, float] | None:
-    given = roi.get("ROIDisplayColor")
-    if given is None or len(given) != 3:
+    rgb = roi.get("ROIDisplayColor")
+    if rgb is None or len(rgb) != 3:
         return None
-    red, green, blue = (min(255, max(0, int(c))) / 255 for c in given)
+    red, green, blue = (min(255, max(0, int(c))) / 255 for c in rgb)
     return red, green, blue
 
 

@@ -23,18 +23,11 @@ def assign_tissues(
 ) -> list[LabelMap]:
     """The maps with the tissues that the user assigned, by names or values.
 
-    A label given as the organ and as a tissue is the tissue. A tissue's value, or its segment in ``empty``,
-    may be absent (``absent_labels``), so that one command is right for many patients.
-
-    Args:
-        maps: all label maps.
-        organ: segments of the organ; those without a tissue become kidney.
-        chosen: tissue -> all of its segments.
-        empty: segments of the files that no voxel has.
-
-    Raises:
-        PatientError: an absent label of the organ, a name that no segment has, or one segment given as two
-        tissues.
+    ``organ`` are the segments of the organ; those without a tissue become kidney. ``chosen`` has all segments
+    of each tissue; a label assigned to the organ and to a tissue is the tissue. A tissue's value, or its
+    segment in ``empty``, the segments of the files that no voxel has, may be absent (``absent_labels``), so
+    that one command is right for many patients. Raises PatientError for an absent label of the organ, a name
+    that no segment has, and one segment assigned to two tissues.
     """
     segments = _segments(maps)
     for word in [*organ, *(word for words in chosen.values() for word in words)]:
@@ -54,14 +47,14 @@ def assign_tissues(
                 )
 
     def assigned(segment: Segment) -> Segment:
-        found = [tissue for tissue, words in chosen.items() if any(segment.matches(word) for word in words)]
-        if len(found) > 1:
+        tissues = [tissue for tissue, words in chosen.items() if any(segment.matches(word) for word in words)]
+        if len(tissues) > 1:
             raise PatientError(
-                f"label {segment} is given as {' and as '.join(map(_in_words, found))}: give it as one of "
+                f"label {segment} is given as {' and as '.join(map(_in_words, tissues))}: give it as one of "
                 "them"
             )
-        if found:
-            return replace(segment, tissue=found[0])
+        if tissues:
+            return replace(segment, tissue=tissues[0])
         if segment.tissue in chosen:
             segment = replace(segment, tissue=None)
         is_organ = any(segment.matches(word) for word in organ)
@@ -117,18 +110,12 @@ def choose_segments(
 ) -> tuple[list[LabelMap], tuple[str, ...]]:
     """The maps without segments that are no organ, and notes that name these.
 
-    Derived structures are left out, and so is a kidney that is drawn a second time under a longer name. Other
-    segments that are one structure drawn twice, such as two observers', are united when the maps are merged:
-    a note names them. A small segment in a kidney whose name has the word kidney and others is a finding of
-    no known tissue.
-
-    Args:
-        maps: with the tissues that the user assigned.
-        words: names or values of segments that the user gave: these are never left out.
-        is_organ_named: whether the user named the organ: then that is the kidney, and no other is.
-
-    Raises:
-        PatientError: nothing else is there.
+    The maps have the tissues that the user assigned; ``words`` are names or values of segments that the user
+    named: these are never left out. With ``is_organ_named`` the organ that the user named is the kidney, and
+    no other is. Derived structures are left out, and so is a kidney that is drawn a second time under a
+    longer name. Other segments that are one structure drawn twice, such as two observers', are united when
+    the maps are merged: a note names them. A small segment in a kidney whose name has the word kidney and
+    others is a finding of no known tissue. Raises PatientError where nothing else is there.
     """
     derived = [
         segment

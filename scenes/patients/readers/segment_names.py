@@ -148,14 +148,14 @@ def _tissue(name: str) -> str | None:
     plain = _plain(name)
     if plain in OWN_NAMES:
         return OWN_NAMES[plain]
-    found = next((tissue for tissue, pattern in TISSUE_OF_NAME if re.search(pattern, plain)), None)
-    if found in ("tumour", "cyst"):
+    tissue = next((tissue for tissue, pattern in TISSUE_OF_NAME if re.search(pattern, plain)), None)
+    if tissue in ("tumour", "cyst"):
         parts = re.match(COMPOSITE, unicodedata.normalize("NFC", name))
         if parts is not None and _tissue(parts[1]) == "kidney":
             return "kidney"
         is_renal = re.search(dict(TISSUE_OF_NAME)["kidney"], plain) is not None
-        return "" if re.search(OTHER_ORGANS, plain) and not is_renal else found
-    return found
+        return "" if re.search(OTHER_ORGANS, plain) and not is_renal else tissue
+    return tissue
 
 
 def is_far(name: str) -> bool:
@@ -194,8 +194,8 @@ def public_text(sentence: str) -> str:
 def side_of(name: str) -> Side | None:
     """The side in a name such as kidney_left or "Kidney R"; None where it has none, or both."""
     plain = _plain(name)
-    found = [side for side, pattern in SIDE_OF_NAME if re.search(pattern, plain)]
-    return found[0] if len(found) == 1 else None
+    sides = [side for side, pattern in SIDE_OF_NAME if re.search(pattern, plain)]
+    return sides[0] if len(sides) == 1 else None
 
 
 def same_name(one: str, other: str) -> bool:

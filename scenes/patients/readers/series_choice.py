@@ -31,18 +31,12 @@ def choose_series(
     labels: DicomReferences = NO_REFERENCES,
     grid: VoxelGrid | None = None,
 ) -> tuple[Series, list[str]]:
-    """The chosen series, and a note with the reason where there are several.
+    """The chosen one of all CT series, and a note with the reason where there are several.
 
-    Args:
-        path: for errors.
-        candidates: all CT series, one or more.
-        wanted: number of a series, or its UID or the end of it.
-        labels: what the labels refer to.
-        grid: the labels' own voxels, where they are a label map.
-
-    Raises:
-        PatientError: no such series, or series of several patients, of which the labels show none to be
-        theirs.
+    ``wanted`` is the number of a series, or its UID or the end of it. ``labels`` are what the labels refer
+    to; ``grid`` are the labels' own voxels, where they are a label map. Errors name the ``path``. Raises
+    PatientError where there is no such series, or series of several patients, of which the labels show none
+    to be theirs.
     """
     if wanted is not None:
         return _wanted(path, candidates, wanted), []
@@ -126,9 +120,9 @@ def _certainty(series: Series, labels: DicomReferences, grid: VoxelGrid | None) 
         labels.instances & own.instances,
         labels.series & own.series,
     )
-    found = max((n for n, shared in enumerate(levels, start=3) if shared), default=0)
-    if found or grid is None or len(series.slices) < 2:
-        return found
+    certainty = max((n for n, shared in enumerate(levels, start=3) if shared), default=0)
+    if certainty or grid is None or len(series.slices) < 2:
+        return certainty
     return _on_its_voxels(series, grid)
 
 

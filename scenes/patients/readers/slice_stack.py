@@ -47,7 +47,7 @@ def stack_slices(
 ) -> LazyVolume:
     """One volume of slices, in HU.
 
-    Raises PatientError: too few, not parallel, or one missing or in conflict.
+    Raises PatientError where they are too few or not parallel, or one is missing or in conflict.
     """
     if len(slices) < 2:
         raise PatientError(

@@ -36,18 +36,12 @@ NAMED_OPENINGS = 3
 def read_surfaces(
     files: Sequence[Path], near_mm: float, progress: Progress, space: Space | None = None
 ) -> Segmentation:
-    """One structure a file, named by the file. Of other structures than kidneys only the part near these is
-    labelled.
+    """One structure a file, named by the file, of one or more. Of other structures than kidneys only the part
+    within ``near_mm`` of these is labelled.
 
-    Args:
-        files: one or more.
-        near_mm: how near to a kidney.
-        progress: shows the progress of reading.
-        space: of files that state none.
-
-    Raises:
-        PatientError: no closed surface in mm; later, on the CT's grid: outside the CT, or bodies that cover
-        each other.
+    ``space`` is that of files that state none; ``progress`` shows the progress of reading. Raises
+    PatientError where there is no closed surface in mm; later, on the CT's grid, where one is outside the CT
+    or bodies cover each other.
     """
     stated = {file: stated_space(file) for file in files}
     spaces = {file: own or space for file, own in stated.items()}
@@ -60,11 +54,11 @@ def read_surfaces(
         corners = [surfaces[file].bounds for file in files if segments[file].tissue == "kidney"]
         near = np.concatenate(corners or [surface.bounds for surface in surfaces.values()])
         low, high = near.min(axis=0) - near_mm, near.max(axis=0) + near_mm
-        found = []
+        label_maps = []
         for file, surface in surfaces.items():
             if grid := _grid_of(surface, low, high):
-                found.append(LabelMap.single(grid, _voxels(file, surface, grid), segments[file]))
-        return found
+                label_maps.append(LabelMap.single(grid, _voxels(file, surface, grid), segments[file]))
+        return label_maps
 
     assumed = sum(space is None for space in spaces.values())
     return Segmentation(
@@ -113,8 +107,8 @@ def _openings(vertices: np.ndarray, edges: np.ndarray) -> list[tuple[np.ndarray,
     ways = np.bincount(place.ravel(), np.where(edges[:, 0] < edges[:, 1], 1, -1), len(pairs))
     alone = pairs[(ways != 0) & (pairs[:, 0] != pairs[:, 1])]
     groups = trimesh.graph.connected_components(alone, min_len=2)
-    found = [vertices[group] for group in groups]
-    return [(places.mean(axis=0), float(np.ptp(places, axis=0).max())) for places in found]
+    openings = [vertices[group] for group in groups]
+    return [(places.mean(axis=0), float(np.ptp(places, axis=0).max())) for places in openings]
 
 
 def _check_place(file: Path, surface: trimesh.Trimesh, space: Space | None, ct: VoxelGrid) -> None:
