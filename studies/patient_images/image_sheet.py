@@ -12,7 +12,7 @@ from PIL import Image
 
 from scenes.atomic_files import atomic_write
 from studies.patient_images.patient_image_scans import ImagedPatient, PlaneScan
-from studies.patient_images.picture_truth import pixel_places
+from studies.patient_images.patient_truth import pixel_places
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -13,11 +13,10 @@ from rehearsal.commands.command_line import CommandError, load_patient, make_fol
 from rehearsal.result_files import rounded
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
+from studies.image_quality import NOISE_DEPTHS_MM, depth_of_noise_mm, snr_db
+from studies.patient_images.image_figures import agent_figures, capsule_figures, picture_figures
 from studies.patient_images.image_sheet import write_sheet
 from studies.patient_images.patient_image_scans import ImagedPatient
-from studies.patient_images.picture_figures import picture_figures
-from studies.patient_images.scanline_figures import agent_figures, capsule_figures
-from studies.patient_images.signal_to_noise import DEPTHS_MM, depth_of_noise_mm, snr_db
 from studies.study_options import out_option
 from studies.study_results import table_of, write_results
 from ultrasound.probe import Probe, load_probe
@@ -43,7 +42,7 @@ COLUMNS = (
 
 NOISE_COLUMNS = (
     ("speckle of cortex over noise [dB]", "{probe}"),
-    *((f"at {depth:g} mm", f"{{at_{depth:g}_mm_db:.1f}}") for depth in DEPTHS_MM),
+    *((f"at {depth:g} mm", f"{{at_{depth:g}_mm_db:.1f}}") for depth in NOISE_DEPTHS_MM),
     ("0 dB at [mm]", "{noise_depth_mm:.0f}"),
 )
 
@@ -143,6 +142,6 @@ def _noise(name: str, probe: Probe) -> dict[str, str | float | None]:
     """Return a row: speckle of cortex over noise [dB] by depth, and the depth at which it is 0 dB [mm]."""
     levels = {
         f"at_{depth:g}_mm_db": rounded(float(snr))
-        for depth, snr in zip(DEPTHS_MM, snr_db(probe, np.array(DEPTHS_MM)), strict=True)
+        for depth, snr in zip(NOISE_DEPTHS_MM, snr_db(probe, np.array(NOISE_DEPTHS_MM)), strict=True)
     }
     return {"probe": name, **levels, "noise_depth_mm": rounded(depth_of_noise_mm(probe))}

@@ -30,12 +30,11 @@ from sim.device import start
 from sim.neo_hookean import LATTICE_SETTINGS
 from sim.shapes import Plane
 from sim.solver import Solver, StepSettings
-from studies.harness import build, memory_mb, memory_of_process_mb
+from studies.harness import block_of_cells, block_of_particles, build, memory_mb, memory_of_process_mb
 from studies.performance.lower_bound import compare
 from studies.performance.step_phases import AFTER, BEFORE, CONTACTS, IN_ITERATION, Phases, without_calls
 from studies.study_options import open_study, out_option, scene_argument
 from studies.study_results import finish_axes, table_of, write_results
-from studies.uniform_blocks import block_of_cells, block_of_particles
 from ultrasound.probe_manipulator import advanced, poses_between
 
 AWAY_MM = 100.0

@@ -23,7 +23,7 @@ from sim.solver import StepSettings
 from studies.accuracy.bead_case import BeadCase, load_case
 from studies.accuracy.bead_errors import bead_errors, null_errors
 from studies.accuracy.bead_experiment import BeadExperiment
-from studies.resection.cut_lines import line_over
+from studies.resection.planned_cuts import line_over
 from ultrasound.probe_manipulator import poses_between
 
 UNCUT = Path(__file__).parents[1] / "reference" / "embedded"
@@ -143,8 +143,7 @@ def cut_case(uncut: BeadCase) -> tuple[CutCase, np.ndarray]:
 
     Raises MeshError, NotConvergedError, ResectionError.
     """
-    from studies.reference.make_reference import blue_noise, in_case_frame
-    from studies.reference.pressed_beads import pressed_beads
+    from studies.reference.make_reference import blue_noise, in_case_frame, pressed_beads
 
     anatomy, gravity = embedded_anatomy(), np.array(load_scene(PAPER).gravity.direction)
     cut = embedded_cut(anatomy)

@@ -14,7 +14,7 @@ from rehearsal.resection.operation import cut_command
 from rehearsal.resection.proposal import marks_around
 from rehearsal.resection.score_line import ResectionError, score_line
 from rehearsal.stopwatch import timed
-from studies.resection.cut_lines import line_over
+from studies.resection.planned_cuts import line_over
 from ultrasound.anatomy_volumes import AnatomyVolumes
 from ultrasound.crater import Crater
 

@@ -17,7 +17,7 @@ from sim.device import start
 from studies.harness import rehearsal_of, without_images
 from studies.resection.cut_balance import BALANCE_BAR_MM, COARSER_MM, EDGE_MM, balance_rows
 from studies.resection.cut_times import REPEATS, ROUNDS, STEPS, cut_times
-from studies.resection.margin_rows import MARGIN_BAR_MM, VOLUME_BAR, margin_rows
+from studies.resection.planned_cuts import MARGIN_BAR_MM, VOLUME_BAR, margin_rows
 from studies.resection.random_cuts import random_results, summary
 from studies.study_options import out_option
 from studies.study_results import table_of, text_table, write_results

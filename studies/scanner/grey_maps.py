@@ -15,7 +15,7 @@ from sim.fields import fill
 from studies.echo.echo_phantom import EchoPhantom
 from studies.image_quality import grey_figures
 from studies.scanner.recorded_speckle import DEPTH_MM, HALF_SECTOR_DEG, RADIUS_MM
-from studies.scanner.scanner_row import ScannerRow
+from studies.scanner.recordings import ScannerRow
 
 PART = "grey values"
 # Of the picture of the curved array (PLUS's configuration): mm per pixel, and the pixel at the middle of the

@@ -18,7 +18,7 @@ from studies.image_quality import (
     speckle_snr,
     without_depth_trend,
 )
-from studies.scanner.scanner_row import ScannerRow
+from studies.scanner.recordings import ScannerRow
 from ultrasound.probe import Probe
 
 PART = "speckle"

@@ -1,5 +1,5 @@
-"""Recordings of real scanners, which are no part of this project: where they are in a folder, and reading
-them.
+"""Recordings of real scanners, which are no part of this project: where they are in a folder, reading them,
+and the rows of what is measured of them.
 """
 
 from dataclasses import dataclass
@@ -12,6 +12,21 @@ from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
 from errors import UserError
+
+
+@dataclass(frozen=True)
+class ScannerRow:
+    """A quantity: of the recording, ours beside it where there is one, its unit, and what has to be known
+    of it.
+    """
+
+    part: str
+    quantity: str
+    recorded: float | None
+    ours: float | None = None
+    unit: str = ""
+    note: str = ""
+
 
 # Beside a checkout of the project.
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data" / "us"

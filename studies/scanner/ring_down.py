@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from studies.scanner.scanner_row import ScannerRow
+from studies.scanner.recordings import ScannerRow
 from ultrasound.probe import Probe
 from ultrasound.pulse import DB_OF_NEPER
 from ultrasound.reverberation import BANDS, FALL_IN_AIR, LENS, MORE_IN_AIR_DB

@@ -11,8 +11,7 @@ import numpy as np
 
 from studies.echo.echo_phantom import EchoPhantom
 from studies.echo.simus_beam import pymust
-from studies.scanner.recordings import ChannelData
-from studies.scanner.scanner_row import ScannerRow
+from studies.scanner.recordings import ChannelData, ScannerRow
 from ultrasound.doppler import Doppler, autocorrelation
 from ultrasound.probe import Probe
 

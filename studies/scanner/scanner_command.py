@@ -23,11 +23,11 @@ from studies.scanner.recordings import (
     SPINE,
     WIRES,
     WIRES_CONFIGURATION,
+    ScannerRow,
     read_channel_data,
     read_iq,
     read_picture,
 )
-from studies.scanner.scanner_row import ScannerRow
 from studies.study_options import out_option
 from studies.study_results import finish_axes, table_of, write_results
 from ultrasound.probe import load_probe

@@ -11,8 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.ndimage import find_objects, label
 
-from studies.scanner.recordings import RecordingError
-from studies.scanner.scanner_row import ScannerRow
+from studies.scanner.recordings import RecordingError, ScannerRow
 from ultrasound.beam import lateral_profiles
 from ultrasound.probe import Probe
 from ultrasound.sweep import load_constants

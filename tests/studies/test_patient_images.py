@@ -23,17 +23,27 @@ from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_maps import LabelMap
 from scenes.scene import AnatomyFiles, Scene
 from studies.echo.echo_phantom import EchoPhantom
+from studies.image_quality import depth_of_noise_mm, snr_db
 from studies.patient_images import patient_image_scans, patient_images_command
+from studies.patient_images.image_figures import (
+    agent_figures,
+    capsule_figures,
+    level_at_like_depth,
+    picture_figures,
+    roc_area,
+)
 from studies.patient_images.image_sheet import COLOURS, coloured
 from studies.patient_images.kidney_outline import closed, dice, kidney_contour, outlined_kidney
-from studies.patient_images.patient_image_scans import ImagedPatient
-from studies.patient_images.patient_truth import PatientTruth, on_scanlines, sample_depths
-from studies.patient_images.picture_figures import picture_figures, roc_area
-from studies.patient_images.picture_truth import picture_truth, pixel_places
-from studies.patient_images.scanline_figures import agent_figures, capsule_figures, level_at_like_depth
-from studies.patient_images.scanline_truth import ScanlineTruth, incidence_deg
-from studies.patient_images.signal_to_noise import depth_of_noise_mm, snr_db
-from studies.patient_images.standard_planes import standard_planes
+from studies.patient_images.patient_image_scans import ImagedPatient, standard_planes
+from studies.patient_images.patient_truth import (
+    PatientTruth,
+    ScanlineTruth,
+    incidence_deg,
+    on_scanlines,
+    picture_truth,
+    pixel_places,
+    sample_depths,
+)
 from ultrasound.acoustics import CORTEX_DB, acoustic_table, tissue_table
 from ultrasound.probe import load_probe
 from ultrasound.scanned_anatomy import ScannedAnatomy

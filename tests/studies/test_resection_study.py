@@ -21,12 +21,23 @@ from studies.accuracy.bead_case import load_case
 from studies.harness import positions_of
 from studies.resection import resection_command
 from studies.resection.cut_balance import BalanceRow, CutBeadExperiment, CutCase
-from studies.resection.cut_lines import line_over
-from studies.resection.margin_rows import MarginRow, margin_rows
-from studies.resection.random_cuts import RandomResult, random_results, summary, surface_faults
-from studies.resection.random_scores import KINDS, ScoredPatient, random_score
-from studies.resection.voxel_margins import VOXEL_MM, CutFigures, figures_by_voxels, signed_distance_map
-from studies.resection.voxel_solid import RasterGrid
+from studies.resection.planned_cuts import MarginRow, line_over, margin_rows
+from studies.resection.random_cuts import (
+    KINDS,
+    RandomResult,
+    ScoredPatient,
+    random_results,
+    random_score,
+    summary,
+    surface_faults,
+)
+from studies.resection.voxel_margins import (
+    VOXEL_MM,
+    CutFigures,
+    RasterGrid,
+    figures_by_voxels,
+    signed_distance_map,
+)
 
 pytestmark = pytest.mark.usefixtures("arrays_stored")
 

@@ -8,7 +8,7 @@ from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_files import open_labels
 from scenes.phantom.embedded_patient import phantom_folder
 from studies.performance import synthetic_trunk
-from studies.performance.synthetic_trunk import GAP_MM, PIXELS, write_whole_body
+from studies.performance.import_timing import GAP_MM, PIXELS, write_whole_body
 
 
 def embedded() -> tuple[sitk.Image, sitk.Image]:

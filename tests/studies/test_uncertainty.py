@@ -23,9 +23,16 @@ from scenes.scene import Attachment, Scene, with_options
 from sim.fields import array_of
 from studies.harness import rehearsal_of
 from studies.uncertainty import uncertainty_command
-from studies.uncertainty.press_outcomes import QUANTITIES, PressProblem, press_outcome
-from studies.uncertainty.sensitivity import POSITION, bands_of, count_of, indices_of, samples_of
-from studies.uncertainty.unknowns import Unknown, set_values, unknowns_of, with_all_parts
+from studies.uncertainty.uncertainty_command import POSITION, bands_of, count_of, indices_of, samples_of
+from studies.uncertainty.unknowns import (
+    QUANTITIES,
+    PressProblem,
+    Unknown,
+    press_outcome,
+    set_values,
+    unknowns_of,
+    with_all_parts,
+)
 
 
 def patient() -> LoadedAnatomy:
