@@ -1,5 +1,4 @@
-"""Figures of ultrasound images: statistics of speckle, contrast, grey values, and speckle over noise. NumPy.
-"""
+"""Figures of ultrasound images: statistics of speckle, contrast, grey values, speckle over noise. NumPy."""
 
 import numpy as np
 
@@ -53,9 +52,9 @@ def gcnr(inside: np.ndarray, outside: np.ndarray) -> float:
     (Rodriguez-Molares 2020, IEEE TUFFC 67, 745, equation 10). A monotonic grey map does not change it; the
     histograms are of logarithms, whose bins are alike.
     """
-    logs = [np.log(np.maximum(each.ravel(), np.finfo(float).tiny)) for each in (inside, outside)]
+    logs = [np.log(np.maximum(part.ravel(), np.finfo(float).tiny)) for part in (inside, outside)]
     edges = np.histogram_bin_edges(np.concatenate(logs), GCNR_BINS)
-    shares = [np.histogram(each, edges)[0] / each.size for each in logs]
+    shares = [np.histogram(part, edges)[0] / part.size for part in logs]
     return float(1 - np.minimum(*shares).sum())
 
 

@@ -130,10 +130,9 @@ class Calibration:
         trials = []
         for place, setup in enumerate(setups):
             measured = tuple(results[place :: len(setups)])
-            errors = [each.errors for each in measured]
-            trial = CalibrationTrial(
-                setup, measured, self.split.fit_mm(errors), self.split.held_out_mm(errors)
-            )
+            errors = [result.errors for result in measured]
+            fit_mm, held_out_mm = self.split.fit_mm(errors), self.split.held_out_mm(errors)
+            trial = CalibrationTrial(setup, measured, fit_mm, held_out_mm)
             trials.append(trial)
             self.trials.setdefault(setup.tissue.radius_mm, []).append(trial)
         return trials

@@ -69,22 +69,22 @@ class EchoPhantom:
         self.amplitude()
         if self.doppler is None:
             self.doppler = Doppler(self.bmode.sound, self.bmode, self.flow)
-        found = []
+        velocities = []
         for beat in range(BEATS):
             self.doppler.estimate(self.probe, SYSTOLE_S + beat * BEAT_S)
-            found.append(self.doppler.velocity_cm_s(self.probe))
+            velocities.append(self.doppler.velocity_cm_s(self.probe))
         middle = self.probe.number_of_scanlines // 2
         step_mm = self.bmode.sound.stride_of(self.probe) * self.probe.sample_mm
         sample = round(depth_mm / step_mm)
-        return np.stack(found)[:, middle - 4 : middle + 5, sample - 1 : sample + 2]
+        return np.stack(velocities)[:, middle - 4 : middle + 5, sample - 1 : sample + 2]
 
     def fill(
         self, impedance: Values = IMPEDANCE, attenuation: Values = 0.0, backscatter: Values = 0.0
     ) -> None:
         """Set impedance [MRayl], attenuation [dB/cm/MHz] and backscatter."""
         values = np.zeros((*self.u.shape, 1, 4), np.float32)
-        for channel, given in enumerate((impedance, attenuation, backscatter)):
-            values[..., 0, channel] = given(self.u, self.v) if callable(given) else given
+        for channel, quantity in enumerate((impedance, attenuation, backscatter)):
+            values[..., 0, channel] = quantity(self.u, self.v) if callable(quantity) else quantity
         fill((self.tissue.voxels, _thin(values)))
 
     def amplitude(

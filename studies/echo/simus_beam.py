@@ -123,14 +123,14 @@ class SimusBeam:
         options = self.must.utils.Options()
         options.dBThresh, options.WaitBar = THRESHOLD_DB, False
         options.FrequencyStep = step_hz * (longest + delays.max())
-        columns = [1e-3 * each[:, None] for each in (x, y, z)]
+        columns = [1e-3 * axis[:, None] for axis in (x, y, z)]
         if not self.has_elevation:
             columns[1] = None  # type: ignore[call-overload]
-        _, found, kept = self.must.pfield(*columns, delays, parameters, options=options)
+        _, pressure, kept = self.must.pfield(*columns, delays, parameters, options=options)
         self.parameters = parameters
         frequency = np.linspace(0, 2 * parameters.fc, len(kept))
         field = np.zeros((len(kept), len(points)), complex)
-        field[kept] = found[:, 0, :].T
+        field[kept] = pressure[:, 0, :].T
         # Time counts from the focus.
         return frequency, field * np.exp(-2j * np.pi * frequency * to_focus.max())[:, None]
 

@@ -37,8 +37,8 @@ def run_backend(
     run, names = BackendRun(backend), list(cases_of(backend))
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
-    given = theirs, backend, tries_refused, cases_of, os.getpid()
-    child = context.Process(target=_measure, args=given, daemon=True)
+    arguments = theirs, backend, tries_refused, cases_of, os.getpid()
+    child = context.Process(target=_measure, args=arguments, daemon=True)
     end_s = monotonic() + seconds
     child.start()
     theirs.close()

@@ -196,8 +196,8 @@ def level_at_like_depth(
     as the first are; NaN where no bin has LEAST_SAMPLES of both.
     """
     bins = [(depth // BIN_MM).astype(int) for depth in (depth_mm, other_depth_mm)]
-    length = max((int(each.max()) + 1 for each in bins if len(each)), default=1)
-    count, other_count = (np.bincount(each, minlength=length) for each in bins)
+    length = max((int(of_depth.max()) + 1 for of_depth in bins if len(of_depth)), default=1)
+    count, other_count = (np.bincount(of_depth, minlength=length) for of_depth in bins)
     total = np.bincount(bins[0], power, length)
     other_total = np.bincount(bins[1], other_power, length)
     both = (count >= LEAST_SAMPLES) & (other_count >= LEAST_SAMPLES)

@@ -81,9 +81,9 @@ def sheet_figure(patient: ImagedPatient, scans: Sequence[PlaneScan], title: str)
     for scan, column_axes in zip(scans, axes.T, strict=True):
         classes = classes_of(patient, scan)
         shown |= set(np.unique(classes))
-        for image, each in zip((scan.ct, scan.ct, coloured(classes), scan.b_mode), column_axes, strict=True):
-            each.imshow(image, cmap="gray", vmin=0, vmax=255, aspect="auto", interpolation="bilinear")
-            each.axis("off")
+        for image, panel in zip((scan.ct, scan.ct, coloured(classes), scan.b_mode), column_axes, strict=True):
+            panel.imshow(image, cmap="gray", vmin=0, vmax=255, aspect="auto", interpolation="bilinear")
+            panel.axis("off")
         labels = labels_of(patient, scan)
         for name in set(np.unique(labels)) - {""}:
             column_axes[1].contour(labels == name, [0.5], colors=[_hex(name)], linewidths=1)

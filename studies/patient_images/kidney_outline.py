@@ -54,7 +54,7 @@ def outlined_kidney(
     directions = np.sin(_angles())[:, None], np.cos(_angles())[:, None]
     places = [at + radius * to / mm for at, to, mm in zip(centre, directions, pixel_mm, strict=True)]
     level, reached = (
-        ndimage.map_coordinates(each.astype(float), places, order=1) for each in (level, covered)
+        ndimage.map_coordinates(values.astype(float), places, order=1) for values in (level, covered)
     )
     outline = _closed_path(_step_cost(level, reached > 0.5)[:, LEAST_MM : MOST_MM + 1]) + LEAST_MM
     return covered & (away <= np.interp(angle, _angles(), outline, period=2 * np.pi))
@@ -86,8 +86,8 @@ def _step_cost(level: np.ndarray, reached: np.ndarray) -> np.ndarray:
     known = layers(reached.astype(float))
     mean = layers(np.where(reached, level, 0.0)) / np.maximum(known, 1e-6)
     (within, beyond), (known_within, known_beyond) = (
-        (np.roll(each, LAYER_MM // 2, axis=1), np.roll(each, -LAYER_MM // 2, axis=1))
-        for each in (mean, known)
+        (np.roll(layer, LAYER_MM // 2, axis=1), np.roll(layer, -LAYER_MM // 2, axis=1))
+        for layer in (mean, known)
     )
     cost = np.exp(-np.maximum(beyond - within, 0.0) / np.log(CONTRAST))
     return np.where(np.minimum(known_within, known_beyond) > 0.5, cost, UNKNOWN_COST)

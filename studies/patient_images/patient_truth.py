@@ -123,7 +123,7 @@ def signed_distance_of(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
     """
     if not mask.any():
         return np.full(mask.shape, FAR_MM, np.float32)
-    outside, inside = (ndimage.distance_transform_edt(each, sampling=spacing_mm) for each in (~mask, mask))
+    outside, inside = (ndimage.distance_transform_edt(part, sampling=spacing_mm) for part in (~mask, mask))
     return (outside - inside).astype(np.float32)
 
 

@@ -27,7 +27,7 @@ from render.display import display_available
 from render.viewer import Controls
 from render.vulkan_device import vulkan_devices
 from scenes.scene import EMBEDDED
-from studies.study_results import write_results
+from studies.study import Results, write_results
 from version import VERSION
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ class ScriptedHand:
         if measured_s > 0 and self._used_s is None:
             self._used_s, self.loop.times = self._used(), self.times
         if self._used_s is not None and measured_s >= MEMORY_EVERY_S * len(self.memory_mb):
-            self.memory_mb.append(sum(each.memory_info().rss for each in self._processes()) / 1e6)
+            self.memory_mb.append(sum(process.memory_info().rss for process in self._processes()) / 1e6)
         if measured_s > self.seconds:
             self.end()
 
@@ -121,19 +121,19 @@ class ScriptedHand:
         return [this, *this.children(recursive=True)]
 
     def _used(self) -> float:
-        times = [each.cpu_times() for each in self._processes()]
-        return sum(each.user + each.system for each in times)
+        times = [process.cpu_times() for process in self._processes()]
+        return sum(process.user + process.system for process in times)
 
 
 @command(FrameOptions)
-def frames(asked: FrameOptions) -> None:
+def frames(options: FrameOptions) -> None:
     """Measure pictures a second, pace and latency of SCENE in a window.
 
     A script presses and drags the probe by the clock.
     """
     if not display_available():
         raise CommandError("study frames: needs a display; on a machine without one start it under Xvfb")
-    shared = {name: getattr(asked, name) for name in FrameOptions.model_fields if name != "seconds"}
+    shared = {name: getattr(options, name) for name in FrameOptions.model_fields if name != "seconds"}
     hands: list[ScriptedHand] = []
 
     with started_process(True) as process:
@@ -142,17 +142,17 @@ def frames(asked: FrameOptions) -> None:
         with opened(RehearseOptions(**shared), process) as run:
 
             def lead(loop: "WindowLoop") -> None:
-                hands.append(ScriptedHand(loop, run.manipulator.home, run.start, asked.seconds))
+                hands.append(ScriptedHand(loop, run.manipulator.home, run.start, options.seconds))
                 loop.source = hands[0]
 
             run.in_window(prepare=lead)
             # Where the user has closed the window.
             hands[0].end()
-            figures = figures_of(run, hands[0], asked)
-    write_results(asked.out, "frames", figures, summary(figures))
+            figures = figures_of(run, hands[0], options)
+    write_results(options.out, "frames", Results(figures, summary(figures)))
 
 
-def figures_of(run: "RehearsalRun", hand: ScriptedHand, asked: FrameOptions) -> dict[str, Any]:
+def figures_of(run: "RehearsalRun", hand: ScriptedHand, options: FrameOptions) -> dict[str, Any]:
     """The figures of a run; times without the first BEGIN_S."""
     times, window, steps = hand.times, hand.loop.window, hand.times.steps
     layout, settings = window.layout, window.settings
@@ -164,7 +164,7 @@ def figures_of(run: "RehearsalRun", hand: ScriptedHand, asked: FrameOptions) -> 
         arch=run.arch,
         **scene.tissue.model_dump(),
         time_step_s=scene.solver.time_step_s,
-        rate=asked.rate,
+        rate=options.rate,
         substeps=settings.substeps,
         iterations=settings.iterations,
         drivers=[device.name for device in vulkan_devices()],
@@ -183,7 +183,7 @@ def figures_of(run: "RehearsalRun", hand: ScriptedHand, asked: FrameOptions) -> 
         step_lengths_s=lengths_of(steps),
         iterations_least=min(step.iterations for step in steps),
         processor_s_per_s=round(hand.load, 3),
-        memory_mb=[round(each, 1) for each in hand.memory_mb],
+        memory_mb=[round(mb, 1) for mb in hand.memory_mb],
     )
 
 

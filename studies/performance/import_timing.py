@@ -18,12 +18,10 @@ from pydicom.dataset import FileDataset, FileMetaDataset
 from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
 from tqdm import tqdm
 
-from rehearsal.commands.command_line import WholeRange, make_folder
 from scenes.phantom.kidney import make_phantom
 from scenes.volumes.lazy_volume import AIR_HU
 from scenes.volumes.voxel_grid import VoxelGrid
-from studies.study_options import out_option
-from studies.study_results import write_results
+from studies.study import Results, Study, study_command, whole_option
 
 PIXELS, PIXEL_MM = 512, 0.78
 GAP_MM = 0.75
@@ -95,32 +93,27 @@ KIDNEY_OF_PHANTOM = "1,2,3,4,5"
 TUMOUR_OF_PHANTOM = "6"
 
 
-@click.command("import")
-@out_option
-@click.option(
-    "--slices",
-    type=WholeRange(200, 2000),
-    default=800,
-    show_default=True,
-    help="Slices of 512 x 512 pixels.",
+@study_command(
+    "import",
+    whole_option("--slices", 200, 2000, 800, "Slices of 512 x 512 pixels."),
+    whole_option("--runs", 1, 20, 3),
 )
-@click.option("--runs", type=WholeRange(1, 20), default=3, show_default=True)
-def intake(out: Path, slices: int, runs: int) -> None:
+def intake(study: Study, slices: int, runs: int) -> Results:
     """Measure an import: seconds and memory.
 
     Of a synthetic trunk of 512 x 512 pixels a slice, from DICOM and NIfTI labels.
     """
-    make_folder(out)
     with tempfile.TemporaryDirectory() as temporary:
         body = write_whole_body(Path(temporary), slices)
-        found = [_run(body, Path(temporary) / f"patient-{n}") for n in range(runs)]
-    figures = dict(slices=slices, seconds=[s for s, _ in found], peak_gb=[g for _, g in found])
+        seconds, peak_gb = zip(
+            *(_run(body, Path(temporary) / f"patient-{n}") for n in range(runs)), strict=True
+        )
     lines = [
         f"512 x 512 x {slices} CT and labels to a scene, {runs} runs, one after another:",
-        "seconds    " + ", ".join(f"{s:.1f}" for s, _ in found),
-        "memory     " + ", ".join(f"{g:.2f}" for _, g in found) + " GB at most",
+        "seconds    " + ", ".join(f"{s:.1f}" for s in seconds),
+        "memory     " + ", ".join(f"{gb:.2f}" for gb in peak_gb) + " GB at most",
     ]
-    write_results(out, "import", figures, "\n".join(lines))
+    return Results(dict(slices=slices, seconds=seconds, peak_gb=peak_gb), "\n".join(lines))
 
 
 def _run(body: Path, folder: Path) -> tuple[float, float]:

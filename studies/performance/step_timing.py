@@ -7,10 +7,8 @@ Timed are a scene's press at several sizes, and blocks of more and more particle
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise, repeat
-from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 import pandas as pd
 import psutil
@@ -18,9 +16,7 @@ import taichi as ti
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
-from rehearsal.commands.command_line import arch_option
 from rehearsal.configuration import PRESETS, Setup, setup_of
 from rehearsal.rehearsal import Rehearsal, script_length_s
 from rehearsal.result_files import spread
@@ -33,8 +29,8 @@ from sim.solver import Solver, StepSettings
 from studies.harness import block_of_cells, block_of_particles, build, memory_mb, memory_of_process_mb
 from studies.performance.lower_bound import compare
 from studies.performance.step_phases import AFTER, BEFORE, CONTACTS, IN_ITERATION, Phases, without_calls
-from studies.study_options import open_study, out_option, scene_argument
-from studies.study_results import finish_axes, table_of, write_results
+from studies.study import CHOSEN, Results, Study, quick_option, study_command
+from studies.tables_and_panels import draw_panel, panels_of, table_of
 from ultrasound.probe_manipulator import advanced, poses_between
 
 AWAY_MM = 100.0
@@ -85,39 +81,38 @@ class TimedPress:
     warm_up_steps: int
 
 
-@click.command()
-@scene_argument(PAPER)
-@out_option
-@click.option("--quick", is_flag=True, help="Fewer sizes and shorter presses, in less than a minute.")
-@arch_option
-def timing(scene: Path, out: Path, quick: bool, arch: str) -> None:
+@study_command(
+    "timing",
+    quick_option("Fewer sizes and shorter presses, in less than a minute."),
+    scene=PAPER,
+    arch=CHOSEN,
+)
+def timing(study: Study, quick: bool) -> Results:
     """Measure how long a time step of SCENE takes.
 
     Over time, by its pieces, by size, and against a plain loop in C.
     """
-    loaded, anatomy, used = open_study(out, scene, arch)
-    setups = _setups(quick)
-    counts = QUICK_COUNTS if quick else COUNTS
+    scene, anatomy = study.scene
+    setups, counts = _setups(quick), QUICK_COUNTS if quick else COUNTS
     presses, sizes = [], []
     comparison: dict[str, Any] = {}
     missing: list[str] = []
-    with tqdm(total=len(setups) + 2 * len(counts), desc="timing", unit="size") as bar:
+    with study.progress(len(setups) + 2 * len(counts), "size") as bar:
         for setup in setups:
-            rehearsal = build(loaded, anatomy, setup, used)
-            presses.append(measure(rehearsal, setup, QUICK_SHARE if quick else 1.0, used))
+            rehearsal = build(scene, anatomy, setup, study.backend)
+            presses.append(measure(rehearsal, setup, QUICK_SHARE if quick else 1.0, study.backend))
             if setup == PAPERS:
                 comparison, missing = compare(rehearsal)
             bar.update()
-        for size in blocks(counts, used, QUICK_STEPS if quick else STEPS):
+        for size in blocks(counts, study.backend, QUICK_STEPS if quick else STEPS):
             sizes.append(size)
             bar.update()
         bar.total = bar.n
     bound_ms = comparison.get("bound_ms")
     cases = [press.case | dict(bound_ms=bound_ms if press.setup == PAPERS else None) for press in presses]
-    report = dict(arch=used, cases=cases, bound_ms=bound_ms, comparison=comparison, sizes=sizes)
+    report = dict(arch=study.backend, cases=cases, bound_ms=bound_ms, comparison=comparison, sizes=sizes)
     text = "\n".join([table(cases, sizes), *pieces(cases), *against(comparison), *missing])
-    rows = [_flat(case) for case in cases + sizes]
-    write_results(out, "timing", report, text, rows, figure_of(presses, sizes))
+    return Results(report, text, [_flat(case) for case in cases + sizes], figure_of(presses, sizes))
 
 
 def _setups(quick: bool) -> list[Setup]:
@@ -227,11 +222,11 @@ def _size(case: dict) -> float:
 
 def table(cases: list[dict], sizes: list[dict]) -> str:
     """The paper's Table 5, and the blocks."""
-    title = "Time of a step (ms), over warm-up and press (the paper's Table 5):"
     of_cases, of_sizes = (
-        table_of(COLUMNS.items(), [_flat(case) | dict(size_mm=_size(case)) for case in given])
-        for given in (cases, sizes)
+        table_of(COLUMNS, [_flat(case) | dict(size_mm=_size(case)) for case in timed_cases])
+        for timed_cases in (cases, sizes)
     )
+    title = "Time of a step (ms), over warm-up and press (the paper's Table 5):"
     return "\n".join([title, of_cases, "\nBlocks at rest on a plane:", of_sizes])
 
 
@@ -273,15 +268,14 @@ def against(figures: dict) -> list[str]:
 
 def figure_of(presses: list[TimedPress], sizes: list[dict]) -> Figure:
     """The paper's Figures 7 and 8, its Table 5 and time against size, in four panels."""
-    figure = Figure(figsize=(13, 9), layout="constrained")
-    panels = figure.subplots(2, 2)
+    figure, panels = panels_of((13, 9), 2, 2)
     matched = [press for press in presses if press.case["model"] == "shape-matching"]
     _over_time(panels[0, 0], matched[0])
     _pieces(panels[0, 1], presses)
     _radii(panels[1, 0], matched)
     _sizes(panels[1, 1], sizes)
     for axes in (panels[0, 0], panels[1, 0], panels[1, 1]):
-        finish_axes(axes, legend={})
+        draw_panel(axes, legend={})
     return figure
 
 
@@ -312,7 +306,7 @@ def _pieces(axes: Axes, presses: list[TimedPress]) -> None:
     shown = shown.assign(**{"the rest": 100 - shown.sum(axis=1)})
     shown.plot.barh(stacked=True, width=0.8, color=colours, ax=axes)
     axes.set_yticks(
-        range(len(presses)), [f"{each.case['model']} {_size(each.case):g} mm" for each in presses]
+        range(len(presses)), [f"{press.case['model']} {_size(press.case):g} mm" for press in presses]
     )
     axes.invert_yaxis()
     axes.set(title="Pieces of a step (the paper's Fig. 8)", xlabel="% of the step", xlim=(0, 100))

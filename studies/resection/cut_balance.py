@@ -6,7 +6,6 @@ Nephron has the lattice of the whole organ, of which ``remove_tissue`` takes the
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +51,8 @@ class CutBeadExperiment(BeadExperiment):
         self.settles_first = settles_first
         tissue = cut.tissue
         self._organ, removed, remaining = (
-            translated(each, -self.origin) for each in (cut.case.organ, tissue.removed, tissue.remaining)
+            translated(surface, -self.origin)
+            for surface in (cut.case.organ, tissue.removed, tissue.remaining)
         )
         self._tissue = RemovedTissue(removed, remaining, tissue.is_new)
 
@@ -75,31 +75,22 @@ class CutBeadExperiment(BeadExperiment):
 
 @dataclass(frozen=True)
 class BalanceRow:
-    """Mean and largest error of the beads [mm] at each stage, and how far they moved since the first one
-    in the mean.
-    """
+    """Errors of the beads (stages, n) [mm] in a case."""
 
     organ: str
     setup: Setup
     case: BeadCase
     errors: np.ndarray
 
-    @cached_property
-    def means_mm(self) -> list[float]:
-        """Mean error at each stage [mm]."""
-        return [float(stage.mean()) for stage in self.errors]
-
     @property
     def is_within(self) -> bool:
         """Whether the mean error is within 0.15 mm at each stage."""
-        return max(self.means_mm) <= BALANCE_BAR_MM
+        return bool(self.errors.mean(axis=1).max() <= BALANCE_BAR_MM)
 
     def described(self) -> dict[str, object]:
-        """Values for the table and the files."""
-
-        def joined(values: np.ndarray) -> str:
-            return " / ".join(f"{value:.2f}" for value in values)
-
+        """Values for the table and the files: mean and largest error at each stage, and how far the beads
+        moved since the first one in the mean.
+        """
         return dict(
             organ=self.organ,
             beads=len(self.case.beads),
@@ -109,6 +100,11 @@ class BalanceRow:
             moved_mm=joined(null_errors(self.case).mean(axis=1)),
             within="yes" if self.is_within else "no",
         )
+
+
+def joined(values: np.ndarray) -> str:
+    """Values (stages,) in words."""
+    return " / ".join(f"{value:.2f}" for value in values)
 
 
 def balance_rows() -> tuple[list[BalanceRow], np.ndarray]:
@@ -126,8 +122,8 @@ def balance_rows() -> tuple[list[BalanceRow], np.ndarray]:
         "settled, then cut": CutBeadExperiment(cut, setup, settles_first=True),
     }
     rows = [
-        BalanceRow(name, setup, each.case, bead_errors(each.case, each.run(setup).beads))
-        for name, each in experiments.items()
+        BalanceRow(name, setup, tried.case, bead_errors(tried.case, tried.run(setup).beads))
+        for name, tried in experiments.items()
     ]
     return rows, to_coarser
 
@@ -147,15 +143,17 @@ def cut_case(uncut: BeadCase) -> tuple[CutCase, np.ndarray]:
 
     anatomy, gravity = embedded_anatomy(), np.array(load_scene(PAPER).gravity.direction)
     cut = embedded_cut(anatomy)
-    organ, specimen, remnant = (
-        in_case_frame(each, gravity, anatomy.organ) for each in (anatomy.organ, cut.specimen, cut.remnant)
+    support_lps = load_anatomy(load_scene(PAPER), PAPER.parent).shapes[0]
+    assert isinstance(support_lps, trimesh.Trimesh)
+    organ, specimen, remnant, support = (
+        in_case_frame(surface, gravity, anatomy.organ)
+        for surface in (anatomy.organ, cut.specimen, cut.remnant, support_lps)
     )
-    support = load_anatomy(load_scene(PAPER), PAPER.parent).shapes[0]
-    assert isinstance(support, trimesh.Trimesh)
     beads, bed = blue_noise(remnant), faces_of(remnant, cut.on_remnant)
-    given = remnant, bed, in_case_frame(support, gravity, anatomy.organ), beads
-    coarse = pressed_beads(*given, COARSER_MM, uncut.indentation_mm)[0]
-    measured, at, force = pressed_beads(*given, EDGE_MM, uncut.indentation_mm)
+    (coarse, *_), (measured, at, force) = (
+        pressed_beads(remnant, bed, support, beads, edge_mm, uncut.indentation_mm)
+        for edge_mm in (COARSER_MM, EDGE_MM)
+    )
     poses = uncut.poses.copy()
     poses[:, :3, 3] = at
     case = replace(

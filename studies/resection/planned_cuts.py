@@ -4,7 +4,8 @@
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from typing import get_args
+from itertools import product
+from typing import Any, get_args
 
 import numpy as np
 import trimesh
@@ -23,27 +24,16 @@ MARGINS_MM = (0.0, 3.0, 5.0)
 BESIDE_MM, DRAWN_IN, SHALLOW_MM = 10.0, 0.6, 12.0
 
 
-@dataclass(frozen=True)
-class StudyCut:
-    """A cut of the study, and how its line is placed."""
-
-    placed: str
-    settings: CutSettings
-    cut: Cut
-
-
-def planned_cuts(organ: trimesh.Trimesh, tumour: trimesh.Trimesh) -> Iterator[StudyCut]:
-    """All techniques and margins along lines around tumour and margin, then badly placed cuts that leave
-    tumour. Raises ResectionError.
+def planned_cuts(organ: trimesh.Trimesh, tumour: trimesh.Trimesh) -> Iterator[tuple[str, CutSettings, Cut]]:
+    """How its line is placed, settings and cut: all techniques and margins along lines around tumour and
+    margin, then badly placed cuts that leave tumour. Raises ResectionError.
     """
     lines = {margin: line_over(organ, tumour, margin) for margin in MARGINS_MM}
+    around = product(TECHNIQUES, lines.items())
+    planned = [("around", line, CutSettings(technique, margin)) for technique, (margin, line) in around]
     points = np.asarray(tumour.vertices)
-    for technique in TECHNIQUES:
-        for margin, line in lines.items():
-            settings = CutSettings(technique, margin)
-            yield StudyCut("around", settings, cut_organ(organ, line, settings, points))
-    for placed, line, settings in _badly_placed(organ, lines[3.0]):
-        yield StudyCut(placed, settings, cut_organ(organ, line, settings, points))
+    for placed, line, settings in [*planned, *_badly_placed(organ, lines[3.0])]:
+        yield placed, settings, cut_organ(organ, line, settings, points)
 
 
 def line_over(organ: trimesh.Trimesh, tumour: trimesh.Trimesh, margin_mm: float) -> ScoreLine:
@@ -79,27 +69,23 @@ class MarginRow:
     reference: CutFigures
     tumour_ml: float
 
+    def _error(self, name: str) -> float:
+        return abs(getattr(self.ours, name) - getattr(self.reference, name))
+
     @property
     def margin_error_mm(self) -> float:
         """The larger error of least and mean margin [mm]."""
-        return max(
-            abs(getattr(self.ours, name) - getattr(self.reference, name))
-            for name in ("margin_min_mm", "margin_mean_mm")
-        )
+        return max(self._error("margin_min_mm"), self._error("margin_mean_mm"))
 
     @property
     def volume_error(self) -> float:
         """The largest error of the volumes: of specimen and parenchyma as a share of each, of the tumour
         left as one of the tumour.
         """
-        wholes = dict(
-            specimen_ml=self.reference.specimen_ml,
-            tumour_left_ml=self.tumour_ml,
-            parenchyma_ml=self.reference.parenchyma_ml,
-        )
         return max(
-            abs(getattr(self.ours, name) - getattr(self.reference, name)) / whole
-            for name, whole in wholes.items()
+            self._error("specimen_ml") / self.reference.specimen_ml,
+            self._error("tumour_left_ml") / self.tumour_ml,
+            self._error("parenchyma_ml") / self.reference.parenchyma_ml,
         )
 
     @property
@@ -107,34 +93,24 @@ class MarginRow:
         """Whether the margins are within 0.3 mm, and the volumes within 2 %."""
         return self.margin_error_mm <= MARGIN_BAR_MM and self.volume_error <= VOLUME_BAR
 
-    def described(self) -> dict[str, object]:
-        """Values for the table and the files."""
-        pairs = {
-            name: f"{value:.2f} / {getattr(self.reference, name):.2f}"
-            for name, value in asdict(self.ours).items()
-        }
-        pairs["below_5_mm2"] = f"{self.ours.below_5_mm2:.0f} / {self.reference.below_5_mm2:.0f}"
-        how = f"{self.settings.margin_mm:g} mm"
-        if self.settings.depth_mm is not None:
-            how = f"{self.settings.depth_mm:g} mm deep"
+    def described(self) -> dict[str, Any]:
+        """The row of the JSON file, with values for the table."""
+        settings, ours, reference = asdict(self.settings), asdict(self.ours), asdict(self.reference)
+        pairs = {name: f"{value:.2f} / {reference[name]:.2f}" for name, value in ours.items()}
+        pairs["below_5_mm2"] = f"{ours['below_5_mm2']:.0f} / {reference['below_5_mm2']:.0f}"
+        depth_mm = self.settings.depth_mm
         return dict(
             patient=self.patient,
             placed=self.placed,
             technique=self.settings.technique,
-            how=how,
+            how=f"{self.settings.margin_mm:g} mm" if depth_mm is None else f"{depth_mm:g} mm deep",
             **pairs,
             margin_error_mm=round(self.margin_error_mm, 3),
             volume_error_percent=round(100 * self.volume_error, 2),
             within="yes" if self.is_within else "no",
-        )
-
-    def report(self) -> dict[str, object]:
-        """The row for the JSON file."""
-        return dict(
-            self.described(),
-            settings=asdict(self.settings),
-            ours=asdict(self.ours),
-            reference=asdict(self.reference),
+            settings=settings,
+            ours=ours,
+            reference=reference,
         )
 
 
@@ -143,14 +119,13 @@ def margin_rows(patient: str, anatomy: LoadedAnatomy) -> Iterator[MarginRow]:
     organ, tumour = anatomy.organ, anatomy.tumour
     if tumour is None:
         return
-    for planned in planned_cuts(organ, tumour):
-        cut = planned.cut
+    for placed, settings, cut in planned_cuts(organ, tumour):
         # The tissue as it was segmented: the cut is judged at rest.
         at_rest = (organ, cut.specimen, cut.remnant, tumour)
-        carried = Carried(*(np.asarray(each.vertices) for each in at_rest))
+        carried = Carried(*(np.asarray(surface.vertices) for surface in at_rest))
         ours = _figures(judge(cut, organ, tumour, anatomy.parts, carried))
         reference = figures_by_voxels(cut, organ, tumour, anatomy.parts)
-        yield MarginRow(patient, planned.placed, planned.settings, ours, reference, tumour.volume / MM3_OF_ML)
+        yield MarginRow(patient, placed, settings, ours, reference, tumour.volume / MM3_OF_ML)
 
 
 def _figures(judgement: Judgement) -> CutFigures:

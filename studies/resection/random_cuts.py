@@ -50,6 +50,9 @@ class ScoredPatient:
     hilum: np.ndarray
 
 
+Marks = Callable[[ScoredPatient, np.random.Generator], np.ndarray]
+
+
 def random_score(patient: ScoredPatient, seed: int) -> RandomScore:
     """The score and the cut of a seed."""
     random = np.random.default_rng(seed)
@@ -97,35 +100,36 @@ def _around(patient: ScoredPatient, random: np.random.Generator) -> np.ndarray:
     return marks + random.choice([0.0, 1.0]) * DISPLACED_MM * random.normal(size=marks.shape)
 
 
+def _ring(middle: np.ndarray, across: np.ndarray, radius_mm: float, begin: float) -> np.ndarray:
+    """Places (n, 3) at a radius about a place, on the plane of two axes (2, 3), from a share of a step on."""
+    angle = 2 * np.pi * (np.arange(CIRCLE_MARKS) + begin) / CIRCLE_MARKS
+    return middle + radius_mm * np.column_stack([np.cos(angle), np.sin(angle)]) @ across
+
+
 def _circle(
     organ: trimesh.Trimesh, middle: np.ndarray, radius_mm: float, random: np.random.Generator
 ) -> np.ndarray:
     """Marks (n, 3) about a radius from a place, across the surface's normal there."""
     place, normal = places_on(organ, middle)
     across = np.linalg.svd(normal)[2][1:]
-    angle = 2 * np.pi * (np.arange(CIRCLE_MARKS) + random.random()) / CIRCLE_MARKS
-    ring = place + radius_mm * np.column_stack([np.cos(angle), np.sin(angle)]) @ across
-    return places_on(organ, ring)[0]
+    return places_on(organ, _ring(place, across, radius_mm, random.random()))[0]
 
 
-def _anywhere(patient: ScoredPatient, random: np.random.Generator) -> np.ndarray:
-    """A circle at any place, for example far from the tumour."""
-    middle = np.asarray(patient.organ.vertices)[random.integers(len(patient.organ.vertices))]
-    return _circle(patient.organ, middle, random.uniform(4, 25), random)
+def _anywhere(low_mm: float, high_mm: float) -> Marks:
+    """Circles of radii between two at any place, for example far from the tumour."""
 
+    def marks(patient: ScoredPatient, random: np.random.Generator) -> np.ndarray:
+        middle = np.asarray(patient.organ.vertices)[random.integers(len(patient.organ.vertices))]
+        return _circle(patient.organ, middle, random.uniform(low_mm, high_mm), random)
 
-def _tiny(patient: ScoredPatient, random: np.random.Generator) -> np.ndarray:
-    middle = np.asarray(patient.organ.vertices)[random.integers(len(patient.organ.vertices))]
-    return _circle(patient.organ, middle, random.uniform(0.05, 3), random)
+    return marks
 
 
 def _half(patient: ScoredPatient, random: np.random.Generator) -> np.ndarray:
     """Around half of the organ: marks on a plane through it."""
     middle, across = np.asarray(patient.organ.center_mass), np.linalg.svd(_direction(random)[None])[2][1:]
-    angle = 2 * np.pi * np.arange(CIRCLE_MARKS) / CIRCLE_MARKS
     size = np.ptp(patient.organ.vertices, axis=0).max()
-    ring = middle + size * np.column_stack([np.cos(angle), np.sin(angle)]) @ across
-    return places_on(patient.organ, ring)[0]
+    return places_on(patient.organ, _ring(middle, across, size, 0.0))[0]
 
 
 def _hilum(patient: ScoredPatient, random: np.random.Generator) -> np.ndarray:
@@ -138,11 +142,10 @@ def _crossing(patient: ScoredPatient, random: np.random.Generator) -> np.ndarray
     return np.asarray(patient.organ.vertices)[random.integers(len(patient.organ.vertices), size=count)]
 
 
-Marks = Callable[[ScoredPatient, np.random.Generator], np.ndarray]
 KINDS: dict[str, Marks] = {
     "around": _around,
-    "anywhere": _anywhere,
-    "tiny": _tiny,
+    "anywhere": _anywhere(4, 25),
+    "tiny": _anywhere(0.05, 3),
     "half": _half,
     "hilum": _hilum,
     "crossing": _crossing,
@@ -247,24 +250,22 @@ def volume_change(anatomy: DeformedAnatomy, cut: Cut) -> float:
     """Relative change of volume since the cut: whole organ then, remnant now and specimen as cut."""
     remnant = volume_mm3(anatomy.vertices, cut.remnant.faces)
     specimen, organ = (
-        volume_mm3(anatomy.carried_then(np.asarray(each.vertices)), each.faces)
-        for each in (cut.specimen, anatomy.case.organ)
+        volume_mm3(anatomy.carried_then(np.asarray(surface.vertices)), surface.faces)
+        for surface in (cut.specimen, anatomy.case.organ)
     )
     return (remnant + specimen) / organ - 1
 
 
 def summary(results: Sequence[RandomResult]) -> str:
     """How many were made and refused, the reasons, and each failure with its seed."""
-    made = [each for each in results if not each.refused]
-    failed = [each for each in results if each.faults]
+    reasons = Counter(result.reason for result in results if result.refused)
+    failed = [result for result in results if result.faults]
+    refused = reasons.total()
     lines = [
-        f"{len(results)} random scores: {len(made)} cut, {len(results) - len(made)} refused, "
-        f"{len(failed)} failed"
+        f"{len(results)} random scores: {len(results) - refused} cut, {refused} refused, {len(failed)} failed"
     ]
-    reasons = Counter(each.reason for each in results if each.refused)
     lines += [f"  {number:3d} refused: {reason}" for reason, number in reasons.most_common()]
-    lines += [
-        f"  FAILED {each.patient}, seed {each.seed} ({each.kind}): {'; '.join(each.faults)}"
-        for each in failed
-    ]
+    for result in failed:
+        where = f"{result.patient}, seed {result.seed} ({result.kind})"
+        lines.append(f"  FAILED {where}: {'; '.join(result.faults)}")
     return "\n".join(lines)

@@ -27,8 +27,8 @@ class RasterGrid:
     @classmethod
     def around(cls, surfaces: list[trimesh.Trimesh], voxel_mm: float, margin_mm: float) -> "RasterGrid":
         """A grid around surfaces and a margin."""
-        low = np.min([each.bounds[0] for each in surfaces], axis=0) - margin_mm
-        high = np.max([each.bounds[1] for each in surfaces], axis=0) + margin_mm
+        low = np.min([surface.bounds[0] for surface in surfaces], axis=0) - margin_mm
+        high = np.max([surface.bounds[1] for surface in surfaces], axis=0) + margin_mm
         # Centres at odd places, so that no vertex or edge of a surface with round coordinates is straight
         # above one.
         low += voxel_mm * np.array([0.3178, 0.2345, 0.1416])
@@ -103,7 +103,7 @@ def figures_by_voxels(
     specimen.
     """
     grid = RasterGrid.around([cut.specimen, tumour], VOXEL_MM, AROUND_MM)
-    specimen, whole, growth = (grid.inside(each) for each in (cut.specimen, organ, tumour))
+    specimen, whole, growth = (grid.inside(surface) for surface in (cut.specimen, organ, tumour))
     healthy = whole & ~growth
     for name in NOT_PARENCHYMA:
         if name in parts:
@@ -132,7 +132,7 @@ def signed_distance_map(inside: np.ndarray, voxel_mm: float) -> np.ndarray:
     nearest of them is close to the surface; nearer than that it is the mean with the distance from the voxels
     around the solid.
     """
-    of_solid, of_others = (_maurer(each, voxel_mm) for each in (inside, ~inside))
+    of_solid, of_others = (_maurer(voxels, voxel_mm) for voxels in (inside, ~inside))
     near = (of_solid - of_others) / 2
     return np.where(of_solid > voxel_mm, of_solid, np.where(of_others > voxel_mm, -of_others, near))
 
@@ -140,10 +140,10 @@ def signed_distance_map(inside: np.ndarray, voxel_mm: float) -> np.ndarray:
 def _maurer(inside: np.ndarray, voxel_mm: float) -> np.ndarray:
     image = sitk.GetImageFromArray(inside.astype(np.uint8))
     image.SetSpacing([voxel_mm] * 3)
-    found = sitk.SignedMaurerDistanceMap(
+    distance = sitk.SignedMaurerDistanceMap(
         image, insideIsPositive=False, squaredDistance=False, useImageSpacing=True
     )
-    return sitk.GetArrayFromImage(found).astype(float)
+    return sitk.GetArrayFromImage(distance).astype(float)
 
 
 def _at_border(solid: np.ndarray, beside: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

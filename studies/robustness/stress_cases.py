@@ -151,9 +151,8 @@ def _states() -> Iterator[StressCase]:
 
 def _each_axis(extreme: str, name: str, along: float, across: float) -> list[tuple[str, tuple]]:
     """A state for each axis, with one number along that axis and another across it."""
-    return [
-        (extreme.format(axis), (name, *(along if each == axis else across for each in AXES))) for axis in AXES
-    ]
+    numbers = {axis: [along if other == axis else across for other in AXES] for axis in AXES}
+    return [(extreme.format(axis), (name, *values)) for axis, values in numbers.items()]
 
 
 STATES: dict[str, list[tuple[str, tuple]]] = {

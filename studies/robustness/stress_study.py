@@ -6,19 +6,15 @@ An extreme is applied to a body and released, and what remains of the deformatio
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import groupby
-from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from tqdm import tqdm
 
-from rehearsal.commands.command_line import make_folder
 from rehearsal.result_files import rounded
-from rehearsal.worker_processes import Workers, built_once
+from rehearsal.worker_processes import built_once
 from sim.body import BodyState
 from sim.fields import fill
 from sim.neo_hookean import NeoHookean
@@ -33,8 +29,8 @@ from studies.robustness.stress_cases import (
     quick_cases_of,
 )
 from studies.robustness.stress_motion import AWAY_MM, PROBES, STATES
-from studies.study_options import dask_option, jobs_option, out_option
-from studies.study_results import finish_axes, table_of, write_results
+from studies.study import Results, Study, quick_option, study_command
+from studies.tables_and_panels import draw_panel, panels_of, table_of
 from ultrasound.probe_manipulator import advanced
 
 # Cases of one body in a task, after which the progress bar advances; the process keeps the body for the next
@@ -66,38 +62,27 @@ LIFT_MM = 400.0
 YOUNG_KPA, POISSON = 15.0, 0.45
 
 
-@click.command()
-@out_option
-@click.option("--quick", is_flag=True, help="One case of each kind, in one to two minutes.")
-@jobs_option
-@dask_option
-def stability(out: Path, quick: bool, jobs: int | None, dask: str | None) -> None:
+@study_command("stability", quick_option("One case of each kind, in one to two minutes."), has_workers=True)
+def stability(study: Study, quick: bool) -> Results:
     """Stress-test the tissue and see whether it recovers.
 
     Each model, under extremes of settings, tool and state.
     """
-    make_folder(out)
-    given = {model: quick_cases_of(model) if quick else cases_of(model) for model in MODELS}
+    cases = {model: quick_cases_of(model) if quick else cases_of(model) for model in MODELS}
     rows: list[dict[str, Any]] = []
-    with tqdm(total=sum(map(len, given.values())), desc="stability", unit="case") as bar:
-        for found in _figures(given, jobs, dask):
-            rows += found
-            bar.update(len(found))
-    text = f"{table(rows)}\n\n{summary(rows)}"
-    write_results(out, "stability", dict(cases=rows), text, rows, figure_of(rows))
+    with study.workers() as workers, study.progress(sum(map(len, cases.values())), "case") as bar:
+        for batch in workers.map(_run_all, _batches(cases)):
+            rows += batch
+            bar.update(len(batch))
+    return Results(dict(cases=rows), f"{table(rows)}\n\n{summary(rows)}", rows, figure_of(rows))
 
 
-def _figures(
-    given: dict[str, list[StressCase]], jobs: int | None, dask: str | None
-) -> Iterator[list[dict[str, Any]]]:
-    """Batches of figures in the order of the cases, as they are done."""
-    tasks = []
-    for model, cases in given.items():
-        for _, group in groupby(cases, key=lambda case: case.subject):
+def _batches(cases: dict[str, list[StressCase]]) -> Iterator[tuple[str, list[StressCase]]]:
+    """Cases of one model and body, in their order."""
+    for model, of_model in cases.items():
+        for _, group in groupby(of_model, key=lambda case: case.subject):
             same = list(group)
-            tasks += [(model, same[first : first + BATCH]) for first in range(0, len(same), BATCH)]
-    with Workers(jobs, dask) as workers:
-        yield from workers.map(_run_all, tasks)
+            yield from ((model, same[first : first + BATCH]) for first in range(0, len(same), BATCH))
 
 
 def _run_all(model: str, cases: list[StressCase]) -> list[dict[str, Any]]:
@@ -262,20 +247,17 @@ def _reason(rest_error: float, shape_error: float | None) -> str | None:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """A line a model and kind of case: how many, and how they ended."""
-    found = (
-        pd.DataFrame(rows)
-        .groupby(["model", "kind"], sort=False)
-        .agg(
-            cases=("name", "size"),
-            finite=("finite", "sum"),
-            recovered=("recovered", "sum"),
-            restored=("fallback", "count"),
-            worst=("rest_error_mm", "max"),
-            least=("volume_ratio", "min"),
-            most=("volume_ratio", "max"),
-        )
+    kinds = pd.DataFrame(rows).groupby(["model", "kind"], sort=False)
+    counts = kinds.agg(
+        cases=("name", "size"),
+        finite=("finite", "sum"),
+        recovered=("recovered", "sum"),
+        restored=("fallback", "count"),
+        worst=("rest_error_mm", "max"),
+        least=("volume_ratio", "min"),
+        most=("volume_ratio", "max"),
     )
-    return table_of(COLUMNS.items(), found.reset_index().to_dict("records"))
+    return table_of(COLUMNS, counts.reset_index().to_dict("records"))
 
 
 def summary(rows: list[dict[str, Any]]) -> str:
@@ -311,13 +293,12 @@ def figure_of(rows: list[dict[str, Any]]) -> Figure:
     """A panel a model, a bar a kind of case."""
     frame = pd.DataFrame(rows).assign(outcome=[outcome_of(row) for row in rows])
     kinds, models = list(frame.kind.unique()), list(frame.model.unique())
-    figure = Figure(figsize=(12, 0.25 * len(kinds) + 2), layout="constrained")
-    panels = figure.subplots(1, len(models), sharey=True, squeeze=False)[0]
-    for axes, (model, cases) in zip(panels, frame.groupby("model", sort=False), strict=True):
+    figure, panels = panels_of((12, 0.25 * len(kinds) + 2), 1, len(models), sharey=True)
+    for axes, (model, cases) in zip(panels[0], frame.groupby("model", sort=False), strict=True):
         counts = pd.crosstab(cases.kind, cases.outcome).reindex(kinds, columns=list(OUTCOMES), fill_value=0)
         counts.plot.barh(stacked=True, color=OUTCOMES, width=0.8, legend=False, title=model, ax=axes)
-        finish_axes(axes, grid="x", xlabel=f"cases, of {len(cases)}", ylabel="", axisbelow=True)
-    panels[0].invert_yaxis()
+        draw_panel(axes, grid="x", xlabel=f"cases, of {len(cases)}", ylabel="", axisbelow=True)
+    panels[0, 0].invert_yaxis()
     ends = pd.crosstab(frame.outcome, frame.model).reindex(OUTCOMES, columns=models, fill_value=0)
     handles = [
         Patch(color=colour, label=f"{outcome}: {', '.join(map(str, ends.loc[outcome]))}")

@@ -28,6 +28,11 @@ class ScannerRow:
     note: str = ""
 
 
+def rows_of(part: str, *lines: tuple) -> list[ScannerRow]:
+    """Rows of one part; a line has quantity, recorded, ours, unit and note, the last of them may lack."""
+    return [ScannerRow(part, *line) for line in lines]
+
+
 # Beside a checkout of the project.
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data" / "us"
 BK_IQ = "bk_curvilinear/BkCurvilinearRfData.igs.mhd"

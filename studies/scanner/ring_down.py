@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from studies.scanner.recordings import ScannerRow
+from studies.scanner.recordings import ScannerRow, rows_of
 from ultrasound.probe import Probe
 from ultrasound.pulse import DB_OF_NEPER
 from ultrasound.reverberation import BANDS, FALL_IN_AIR, LENS, MORE_IN_AIR_DB
@@ -55,7 +55,7 @@ def carrier_of(iq: np.ndarray) -> float:
     """
     window = np.hanning(iq.shape[1])
     in_phase, quadrature = (
-        np.fft.rfft((each - each.mean(axis=1, keepdims=True)) * window) for each in (iq.real, iq.imag)
+        np.fft.rfft((part - part.mean(axis=1, keepdims=True)) * window) for part in (iq.real, iq.imag)
     )
     cross = (in_phase.conj() * quadrature).mean(axis=0)
     frequency = np.fft.rfftfreq(iq.shape[1])
@@ -78,8 +78,8 @@ def fitted_ring_down(iq: np.ndarray, fitted: slice = FITTED, noise: slice = NOIS
 
     least, most = [noise_db, 0.5, 2.0, -np.pi, 0.0], [noise_db + 120, 100.0, 12.0, 3 * np.pi, 0.49]
     starts = [(noise_db + 50, 8.0, lens, phase, 0.3) for lens in LENSES for phase in PHASES]
-    fits = [least_squares(residual, each, bounds=(least, most), loss="soft_l1") for each in starts]
-    start_db, fall, lens, phase, bands = min(fits, key=lambda each: each.cost).x
+    fits = [least_squares(residual, start, bounds=(least, most), loss="soft_l1") for start in starts]
+    start_db, fall, lens, phase, bands = min(fits, key=lambda fit: fit.cost).x
     return RingDown(depth, level_db, carrier, fall, lens, bands, phase, start_db, noise_db)
 
 
@@ -94,25 +94,14 @@ def measurements(ring: RingDown, probe: Probe) -> list[ScannerRow]:
     """Return the lines of the table; ours beside them, the level above the noise that of a probe."""
     ours_db = probe.ringing_db + MORE_IN_AIR_DB - probe.noise_before_gain_db
     visible = float(ring.depth[FITTED][np.flatnonzero(ring.level_db[FITTED] > ring.noise_db + 6)[-1]])
-    return [
-        ScannerRow(PART, "falls to 1/e in", ring.fall, FALL_IN_AIR, "wavelengths", "TGC not stated"),
-        ScannerRow(PART, "period of its bands", ring.lens, LENS, "wavelengths"),
-        ScannerRow(PART, "bands: half of their depth", ring.bands, BANDS, "of the amplitude"),
-        ScannerRow(
-            PART,
-            "at the face, above the noise",
-            ring.start_db - ring.noise_db,
-            ours_db,
-            "dB",
-            "extrapolated: nearer than 12 wavelengths the recording clips",
-        ),
-        ScannerRow(PART, "within 6 dB of the noise from", visible, None, "wavelengths"),
-        ScannerRow(
-            PART,
-            "carrier",
-            ring.cycles_per_sample,
-            None,
-            "cycles per sample",
-            "from the delay between I and Q; rate of sampling not stated",
-        ),
-    ]
+    clips = "extrapolated: nearer than 12 wavelengths the recording clips"
+    sampled = "from the delay between I and Q; rate of sampling not stated"
+    return rows_of(
+        PART,
+        ("falls to 1/e in", ring.fall, FALL_IN_AIR, "wavelengths", "TGC not stated"),
+        ("period of its bands", ring.lens, LENS, "wavelengths"),
+        ("bands: half of their depth", ring.bands, BANDS, "of the amplitude"),
+        ("at the face, above the noise", ring.start_db - ring.noise_db, ours_db, "dB", clips),
+        ("within 6 dB of the noise from", visible, None, "wavelengths"),
+        ("carrier", ring.cycles_per_sample, None, "cycles per sample", sampled),
+    )

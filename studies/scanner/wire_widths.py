@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.ndimage import find_objects, label
 
-from studies.scanner.recordings import RecordingError, ScannerRow
+from studies.scanner.recordings import RecordingError, ScannerRow, rows_of
 from ultrasound.beam import lateral_profiles
 from ultrasound.probe import Probe
 from ultrasound.sweep import load_constants
@@ -105,18 +105,10 @@ def measurements(depth_mm: np.ndarray, width_mm: np.ndarray, probe: Probe) -> li
         if (step == number).sum() < LEAST_WIRES:
             continue
         middle = (number + 0.5) * DEPTH_STEP_MM
+        recorded = float(np.median(width_mm[step == number]))
         ours = [beam_width_mm(probe, middle, level) for level in LEVELS_DB]
-        text = ", ".join(
-            f"{width:.2f} at {level:g} dB" for width, level in zip(ours[1:], LEVELS_DB[1:], strict=True)
-        )
-        lines.append(
-            ScannerRow(
-                PART,
-                f"lateral width at {middle:g} mm",
-                float(np.median(width_mm[step == number])),
-                ours[0],
-                "mm",
-                f"recorded: half of the grey value, whose map is not stated; ours: -6 dB ({text})",
-            )
-        )
-    return lines
+        others = zip(ours[1:], LEVELS_DB[1:], strict=True)
+        text = ", ".join(f"{width:.2f} at {level:g} dB" for width, level in others)
+        note = f"recorded: half of the grey value, whose map is not stated; ours: -6 dB ({text})"
+        lines.append((f"lateral width at {middle:g} mm", recorded, ours[0], "mm", note))
+    return rows_of(PART, *lines)

@@ -61,22 +61,22 @@ def unknowns_of(scene: Scene, anatomy: LoadedAnatomy) -> list[Unknown]:
     """The parameters of a scene ``with_all_parts``, with the ranges of the table of mechanical properties."""
     table, attachment = mechanical_properties(), scene.attachment
     kidney = table.parts[PARENCHYMA]
-    found = [
+    unknowns = [
         Unknown(f"{PARENCHYMA} modulus", "kPa", *kidney.young_kpa),
         Unknown(f"{PARENCHYMA} Poisson's ratio", "", *kidney.poisson, is_ratio=False),
     ]
     for part in parts_of(case_of(scene, anatomy)):
         if part.material.poisson < FLUID_POISSON:
-            found.append(Unknown(f"{part.name} modulus", "kPa", *table.parts[part.name].young_kpa))
+            unknowns.append(Unknown(f"{part.name} modulus", "kPa", *table.parts[part.name].young_kpa))
     if getattr(scene.tissue, "capsule_n_mm", 0) > 0:
-        found.append(Unknown("capsule", "N/mm", *table.capsule_n_mm))
+        unknowns.append(Unknown("capsule", "N/mm", *table.capsule_n_mm))
     if attachment.radius_mm > 0 and attachment.stiffness_n_mm > 0:
-        found.append(Unknown("pedicle", "N/mm", *table.pedicle_n_mm))
+        unknowns.append(Unknown("pedicle", "N/mm", *table.pedicle_n_mm))
     if attachment.fat_kpa_mm > 0:
-        found.append(Unknown("fat", "kPa/mm", *table.fat_kpa_mm))
+        unknowns.append(Unknown("fat", "kPa/mm", *table.fat_kpa_mm))
     if scene.contact.shape_friction > 0:
-        found.append(Unknown("friction", "", *table.friction, is_ratio=False))
-    return found
+        unknowns.append(Unknown("friction", "", *table.friction, is_ratio=False))
+    return unknowns
 
 
 def set_values(rehearsal: Rehearsal, values: Mapping[str, float]) -> None:
@@ -102,8 +102,8 @@ def set_values(rehearsal: Rehearsal, values: Mapping[str, float]) -> None:
     if "friction" in values:
         organ.contacts.coefficient = values["friction"]
     if "pedicle" in values or "fat" in values:
-        given = {"stiffness_n_mm": "pedicle", "fat_kpa_mm": "fat"}
-        changed = {key: values[name] for key, name in given.items() if name in values}
+        keys = {"stiffness_n_mm": "pedicle", "fat_kpa_mm": "fat"}
+        changed = {key: values[name] for key, name in keys.items() if name in values}
         attachment = case.scene.attachment.model_copy(update=changed)
         _, tethers = attachments_of(attachment, case.origin, np.array(case.press.direction))
         model.set_tether(total_stiffness(tethers, model.lattice, case.organ))
@@ -146,8 +146,8 @@ def _press(rehearsal: Rehearsal, values: dict[str, float]) -> np.ndarray:
         for step in range(press.stage_steps):
             rehearsal.advance(rehearsal.scripted_pose((stage * press.stage_steps + step + 1) * step_s))
         rehearsal.show()
-        found = measure(anatomy, case.probe, touches)
-        quantities = [getattr(found, name) for name in QUANTITIES]
+        measurement = measure(anatomy, case.probe, touches)
+        quantities = [getattr(measurement, name) for name in QUANTITIES]
         tumour = anatomy.tumour_vertices
         centroid = tumour.mean(axis=0) if len(tumour) else np.full(3, np.nan)
         outcomes.append([*(np.nan if q is None else q for q in quantities), *centroid])

@@ -21,7 +21,7 @@ from sim.shapes import ConvexTool, SignedDistanceField
 from sim.solver import Solver
 from sim.surface_contact import SurfaceContacts
 from sim.viscoelasticity import Relaxation
-from studies import study_options
+from studies import study
 from studies.harness import memory_mb
 from studies.performance import feature_costs
 from studies.robustness import soak_study
@@ -110,7 +110,7 @@ def test_kernels_are_counted_where_a_step_is_parallel(device):
 
 
 def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(study_options, "load_patient", lambda _: (briefly(0), small_anatomy()))
+    monkeypatch.setattr(study, "load_patient", lambda _: (briefly(0), small_anatomy()))
     monkeypatch.setattr(feature_costs, "SETTLE_STEPS", 3)
     monkeypatch.setattr(feature_costs, "PRESS_STEPS", 3)
     monkeypatch.setitem(

@@ -24,7 +24,7 @@ from scenes.patients.readers.label_maps import LabelMap
 from scenes.scene import AnatomyFiles, Scene
 from studies.echo.echo_phantom import EchoPhantom
 from studies.image_quality import depth_of_noise_mm, snr_db
-from studies.patient_images import patient_image_scans, patient_images_command
+from studies.patient_images import patient_image_scans
 from studies.patient_images.image_figures import (
     agent_figures,
     capsule_figures,
@@ -35,6 +35,7 @@ from studies.patient_images.image_figures import (
 from studies.patient_images.image_sheet import COLOURS, coloured
 from studies.patient_images.kidney_outline import closed, dice, kidney_contour, outlined_kidney
 from studies.patient_images.patient_image_scans import ImagedPatient, standard_planes
+from studies.patient_images.patient_images_command import COLUMNS
 from studies.patient_images.patient_truth import (
     PatientTruth,
     ScanlineTruth,
@@ -414,6 +415,7 @@ class TestMadePatient:
     def test_what_is_not_labelled_can_be_told_from_the_kidney(self, result):
         (row,) = json.loads((result / "patient-images.json").read_text())["rows"]
         assert (row["patient"], row["title"], row["probe"]) == (1, "Left kidney", "linear")
+        assert {form.strip("{}").split(":")[0] for form in COLUMNS.values()} == set(row)
         assert row["fat_auc"] > 0.85
         assert 0 <= row["outlined"] <= 1 and row["agent_db"] is None
 
@@ -483,8 +485,3 @@ def _index_from_mm(image):
     mm_from_index[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
     mm_from_index[:3, 3] = image.GetOrigin()
     return np.linalg.inv(mm_from_index)
-
-
-def test_the_columns_are_those_of_a_row():
-    names = {form.strip("{}").split(":")[0] for _, form in patient_images_command.COLUMNS}
-    assert names == set(patient_images_command.PatientImageRow.__dataclass_fields__)

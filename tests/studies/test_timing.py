@@ -22,7 +22,7 @@ from sim.neo_hookean import LATTICE_SETTINGS
 from sim.self_contact import SelfContacts
 from sim.shapes import ConvexTool, Plane
 from sim.solver import Solver, StepSettings
-from studies import study_options
+from studies import study
 from studies.harness import memory_mb
 from studies.performance import lower_bound, step_timing
 from studies.performance.step_phases import Phases, without_calls
@@ -107,7 +107,7 @@ def test_memory_is_that_of_the_fields(device, block):
 
 def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys):
     small = setup_of("shape-matching", radius_mm=4.0)
-    monkeypatch.setattr(study_options, "load_patient", lambda _: (briefly(20), small_anatomy()))
+    monkeypatch.setattr(study, "load_patient", lambda _: (briefly(20), small_anatomy()))
     monkeypatch.setattr(step_timing, "PAPERS", small)
     monkeypatch.setattr(step_timing, "_setups", lambda quick: [small])
     monkeypatch.setattr(step_timing, "QUICK_COUNTS", [64])

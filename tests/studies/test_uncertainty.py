@@ -23,7 +23,7 @@ from scenes.scene import Attachment, Scene, with_options
 from sim.fields import array_of
 from studies.harness import rehearsal_of
 from studies.uncertainty import uncertainty_command
-from studies.uncertainty.uncertainty_command import POSITION, bands_of, count_of, indices_of, samples_of
+from studies.uncertainty.uncertainty_command import POSITION, bands_of, indices_of, samples_of
 from studies.uncertainty.unknowns import (
     QUANTITIES,
     PressProblem,
@@ -123,7 +123,7 @@ def test_bands_and_indices_are_those_of_a_known_function():
     """
     unknowns = [Unknown(name, "", 0.0, 0.5, 1.0, is_ratio=False) for name in "abc"]
     values = samples_of(unknowns, 256)
-    assert len(values) == count_of(unknowns, 256) == 256 * 5
+    assert len(values) == 256 * 5
     outcomes = np.full((len(values), 2, len(QUANTITIES) + 3), np.nan)
     outcomes[:, 0, 3] = [2 * each["a"] + each["c"] for each in values]
     outcomes[:, 1, 3] = [each["a"] + 4 * each["b"] for each in values]
@@ -177,7 +177,7 @@ def test_the_command_reports_writes_and_is_read_again(tmp_path, monkeypatch, cap
         def __exit__(self, *_):
             return None
 
-    monkeypatch.setattr(uncertainty_command, "Workers", lambda jobs, dask: Here())
+    monkeypatch.setattr("studies.study.Workers", lambda jobs, dask: Here())
     out = tmp_path / "out"
     assert app.main(["study", "uncertainty", "--samples", "8", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
