@@ -41,6 +41,12 @@ def build(scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str) -> Rehe
     return rehearsal_of(scene_of(scene, setup), without_images(anatomy))
 
 
+def step_of(setup: Setup) -> dict[str, Any]:
+    """The settings of a step, under the names of a report."""
+    names = dict(substeps=setup.substeps, iterations=setup.iterations)
+    return names | dict(time_step_s=setup.solver.time_step_s)
+
+
 def without_images(anatomy: LoadedAnatomy) -> LoadedAnatomy:
     """The same without its CT, which only images need."""
     return replace(anatomy, ct=None)
@@ -96,9 +102,7 @@ FRICTION, CLUSTER_SPACING = 0.35, 3.33
 
 
 def block_of_cells(side: int, cell_mm: float, shapes: list, tool: ConvexTool | None = None) -> Solver:
-    """A cube with a corner at the origin, ``side`` cells along each edge, in contact with shapes, one of
-    which may be the tool.
-    """
+    """A cube from the origin on, ``side`` cells along each edge, in contact with shapes, perhaps a tool."""
     lattice = fill_block((side, side, side), cell_mm)
     body = Body(lattice.nodes)
     cube = trimesh.creation.box(bounds=[[0.0] * 3, [side * cell_mm] * 3])
@@ -109,9 +113,7 @@ def block_of_cells(side: int, cell_mm: float, shapes: list, tool: ConvexTool | N
 def block_of_particles(
     points_mm: np.ndarray, radius_mm: float, shapes: list, tool: ConvexTool | None = None
 ) -> Solver:
-    """Particles at points (n, 3) [mm], a radius apart, in contact with shapes, one of which may be the
-    tool.
-    """
+    """Particles at points (n, 3) [mm], a radius apart, in contact with shapes, of which one may be a tool."""
     rest = RestBody(points_mm, radius_mm, np.full(len(points_mm), radius_mm / 2))
     arranged, patches = group_into_patches(rest, CLUSTER_SPACING)
     body = ParticleBody(arranged)

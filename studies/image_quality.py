@@ -13,14 +13,12 @@ GCNR_BINS = 100
 
 
 def speckle_snr(amplitude: np.ndarray) -> float:
-    """Return mean over SD of the amplitude of a region."""
+    """Mean over SD of the amplitude of a region."""
     return float(amplitude.mean() / amplitude.std())
 
 
 def correlation_length(amplitude: np.ndarray, axis: int) -> float:
-    """Return the lag, in samples of an axis, at which the intensity of a region correlates by 1/2; nan
-    where it never does.
-    """
+    """Lag, in samples of an axis, at which a region's intensity correlates by 1/2; nan if it never does."""
     intensity = np.moveaxis(amplitude**2, axis, 0)
     intensity = intensity - intensity.mean()
     curve = [
@@ -34,21 +32,19 @@ def correlation_length(amplitude: np.ndarray, axis: int) -> float:
 
 
 def without_depth_trend(amplitude: np.ndarray) -> np.ndarray:
-    """Return amplitudes (scanlines, samples) divided by an exponential of depth, which attenuation and TGC
-    leave in a region.
-    """
+    """Amplitudes (scanlines, samples) over the exponential of depth that attenuation and TGC leave."""
     sample = np.arange(amplitude.shape[1])
     level = np.polyfit(sample, np.log((amplitude**2).mean(axis=0)) / 2, 1)
     return amplitude / np.exp(np.polyval(level, sample))
 
 
 def contrast_db(inside: np.ndarray, outside: np.ndarray) -> float:
-    """Return the mean intensity of amplitudes inside a lesion over that outside [dB]."""
+    """Mean intensity of amplitudes inside a lesion over that outside [dB]."""
     return float(10 * np.log10((inside**2).mean() / (outside**2).mean()))
 
 
 def gcnr(inside: np.ndarray, outside: np.ndarray) -> float:
-    """Return the generalized contrast-to-noise ratio of amplitudes: 1 - overlap of their distributions
+    """Generalized contrast-to-noise ratio of amplitudes: 1 - overlap of their distributions
     (Rodriguez-Molares 2020, IEEE TUFFC 67, 745, equation 10). A monotonic grey map does not change it; the
     histograms are of logarithms, whose bins are alike.
     """
@@ -59,7 +55,7 @@ def gcnr(inside: np.ndarray, outside: np.ndarray) -> float:
 
 
 def grey_figures(image: np.ndarray) -> tuple[float, float]:
-    """Return median and 90th percentile of grey values."""
+    """Median and 90th percentile of grey values."""
     median, most = np.percentile(image, [50, 90])
     return float(median), float(most)
 
@@ -69,8 +65,8 @@ DEEPEST_MM, STEP_MM = 300.0, 0.5
 
 
 def snr_db(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
-    """Return the mean square of the speckle of cortex over that of the noise [dB] at depths (n,), in uniform
-    cortex from the array on.
+    """Mean square of the speckle of cortex over that of the noise [dB] at depths (n,), in uniform cortex from
+    the array on.
 
     The level of its speckle, less what a pulse loses on the round trip (``AttenuatedPulse.speckle_db``), less
     ``Probe.noise_before_gain_db``; no loss at interfaces, no elements without contact. Beam and gain change
@@ -84,9 +80,7 @@ def snr_db(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
 
 
 def depth_of_noise_mm(probe: Probe) -> float:
-    """Return the depth at which speckle of cortex has the level of the noise [mm]; NaN where that is
-    deeper than DEEPEST_MM.
-    """
+    """Depth at which speckle of cortex has the level of the noise [mm]; NaN if deeper than DEEPEST_MM."""
     depth = np.arange(0.0, DEEPEST_MM, STEP_MM)
     snr = snr_db(probe, depth)
     below = np.flatnonzero(snr <= 0)

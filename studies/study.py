@@ -112,9 +112,7 @@ def study_command(
 
 
 def write_results(out: Path, name: str, results: Results) -> None:
-    """Write name.json and, where there are any, name.csv and name.png into a folder; print the text and
-    their names.
-    """
+    """Write name.json and, if there are any, name.csv and name.png; print the text and their names."""
     files = [f"{name}.json"]
     write_json(results.report, out / files[0])
     if results.rows is not None:

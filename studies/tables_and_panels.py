@@ -16,9 +16,7 @@ Row = Mapping[str, Any]
 
 
 def table_of(columns: Columns, rows: Iterable[Row]) -> str:
-    """Aligned columns: under each header a format of a row's values, such as "{ms:.2f}"; empty where that
-    value is None.
-    """
+    """Aligned columns: under each header a format of a row's values, such as "{ms:.2f}"; None is empty."""
     pairs = columns.items() if isinstance(columns, Mapping) else columns
     cells = [[_formatted(form, row) for _, form in pairs] for row in rows]
     sides = ["right" if ":" in form else "left" for _, form in pairs]

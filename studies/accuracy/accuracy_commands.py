@@ -165,31 +165,20 @@ def _fit_shape_matching(options: CalibrateOptions) -> None:
     make_folder(out)
     from studies.accuracy import calibration, calibration_results, case_workers
 
-    split = calibration.split_of(loaded, options.hold_out)
-    with Workers(options.jobs, options.dask) as workers:
-        evaluate = partial(workers.map, case_workers.evaluate)
-        if generations:
-            count = calibration.search_count(len(loaded), len(radii_mm), generations)
-        else:
-            count = calibration.exhaustive_count(len(loaded), len(radii_mm), spacing)
-        with tqdm(total=count, desc="calibrate", unit="press") as bar:
-            fit = calibration.Calibration(loaded, split, evaluate, bar.update)
-            if generations:
-                fit.search(radii_mm, generations)
-            else:
-                fit.exhaustive(radii_mm, spacing)
-            bar.total = bar.n
-    tables = calibration_results.tables_of(fit)
-    for table in tables:
-        table.write_csv(out)
-        table.write_png(out)
-        click.echo(f"\n{table.text()}")
-    calibration_results.write_calibration(fit, tables, out / "calibration.json")
-    calibration_results.write_figure5(fit, out / "figure5.png")
+    split, sizes = calibration.split_of(loaded, options.hold_out), (len(loaded), len(radii_mm))
     if generations:
-        calibration_results.write_search(fit, out / "search.png")
+        count = calibration.search_count(*sizes, generations)
     else:
-        calibration_results.write_figure4(fit, out / "figure4.png")
-    click.echo(
-        f"\n{calibration_results.summary_of(fit)}\nWrote tables, figures and calibration.json to {out}"
-    )
+        count = calibration.exhaustive_count(*sizes, spacing)
+    with (
+        Workers(options.jobs, options.dask) as workers,
+        tqdm(total=count, desc="calibrate", unit="press") as bar,
+    ):
+        evaluate = partial(workers.map, case_workers.evaluate)
+        fit = calibration.Calibration(loaded, split, evaluate, bar.update)
+        if generations:
+            fit.search(radii_mm, generations)
+        else:
+            fit.exhaustive(radii_mm, spacing)
+        bar.total = bar.n
+    calibration_results.write(fit, out, searched=bool(generations))

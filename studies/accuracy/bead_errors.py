@@ -8,6 +8,7 @@ from rehearsal.configuration import Setup
 from rehearsal.result_files import counted, rounded, spread
 from studies.accuracy.bead_case import BeadCase
 from studies.accuracy.bead_experiment import BeadExperiment, BeadRun
+from studies.harness import step_of
 from studies.reference.smooth_obstacles import RoundedBox
 from studies.tables_and_panels import table_of
 
@@ -40,16 +41,12 @@ def bead_errors(case: BeadCase, beads: np.ndarray) -> np.ndarray:
 
 
 def null_errors(case: BeadCase) -> np.ndarray:
-    """Errors (stages, n) [mm] of predicting no motion: beads that stay where they were measured at stage
-    0.
-    """
+    """Errors (stages, n) [mm] of predicting no motion: of beads that stay where they are at stage 0."""
     return np.linalg.norm(case.measured - case.measured[0], axis=2)
 
 
 def probe_distances(case: BeadCase) -> np.ndarray:
-    """Distances (stages, n) [mm] of the measured beads from the probe's surface at their stage; negative
-    inside it.
-    """
+    """Distances (stages, n) [mm] of the measured beads from the probe's surface, negative inside it."""
     box = RoundedBox(case.size_mm, case.edge_radius_mm)
     placed = zip(case.measured, case.poses, strict=True)
     return np.stack([box.gap((beads - pose[:3, 3]) @ pose[:3, :3]) for beads, pose in placed])
@@ -102,18 +99,14 @@ def correlation(first: np.ndarray, second: np.ndarray) -> float | None:
 
 
 def report(experiment: BeadExperiment, setup: Setup, run: BeadRun) -> dict:
-    """The figures of ``validate --json``; the correlation is over all beads at all stages with
-    indentation.
-    """
+    """The figures of ``validate --json``; the correlation is over all beads at stages with indentation."""
     case = experiment.case
     errors = bead_errors(case, run.beads)
     return dict(
         case=case.name,
         model=setup.model,
         **experiment.size(setup),
-        substeps=setup.substeps,
-        iterations=setup.iterations,
-        time_step_s=setup.solver.time_step_s,
+        **step_of(setup),
         parts=[part.name for part in case.parts],
         stages=[
             figures | forces
@@ -191,9 +184,8 @@ def _bands(distances: np.ndarray, errors: np.ndarray) -> list[str]:
     """Mean errors in bands of distance that hold equally many beads."""
     order = np.argsort(distances, kind="stable")
     return [
-        f"  {distances[band].min():5.1f} to {distances[band].max():5.1f} mm  {errors[band].mean():5.2f} "
-        "mm on average, "
-        f"{errors[band].max():5.2f} at most ({len(band)} bead positions)"
+        f"  {distances[band].min():5.1f} to {distances[band].max():5.1f} mm  {errors[band].mean():5.2f} mm on "
+        f"average, {errors[band].max():5.2f} at most ({len(band)} bead positions)"
         for band in np.array_split(order, DISTANCE_BANDS)
         if len(band)
     ]

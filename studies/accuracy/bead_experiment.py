@@ -128,9 +128,7 @@ class BeadExperiment:
         return moved
 
     def size(self, setup: Setup) -> dict[str, float]:
-        """Size of the model, under the names of a report: ``radius_mm`` or ``cell_mm``, ``particles`` or
-        ``nodes``.
-        """
+        """Size of the model, under a report's names: ``radius_mm`` or ``cell_mm``, and its counts."""
         return {setup.tissue.size_key: setup.size_mm, **self.model.counts()}
 
     def describe(self, setup: Setup) -> str:

@@ -8,6 +8,7 @@ from functools import partial
 from itertools import accumulate
 from pathlib import Path
 
+import click
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.figure import Figure
@@ -34,9 +35,7 @@ Row = list[float | None]
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of names and one figure a radius; ``shares``, where there are any, are the figures as % of the
-    probe's travel.
-    """
+    """Rows of names and one figure a radius; ``shares``, if any, are those in % of the probe's travel."""
 
     name: str
     title: str
@@ -98,6 +97,22 @@ def tables_of(calibration: Calibration) -> list[Table]:
         _bead_table(calibration, best, "table4", "Table 4: bead error, maximum (mm)", np.max),
     ]
     return [means, *(replace(table, shares=[]) for table in others), _times(calibration, best)]
+
+
+def write(calibration: Calibration, out: Path, searched: bool) -> None:
+    """Write tables, figures and calibration.json into a folder, and print the tables. Raises OSError."""
+    tables = tables_of(calibration)
+    for table in tables:
+        table.write_csv(out)
+        table.write_png(out)
+        click.echo(f"\n{table.text()}")
+    write_calibration(calibration, tables, out / "calibration.json")
+    write_figure5(calibration, out / "figure5.png")
+    if searched:
+        write_search(calibration, out / "search.png")
+    else:
+        write_figure4(calibration, out / "figure4.png")
+    click.echo(f"\n{summary_of(calibration)}\nWrote tables, figures and calibration.json to {out}")
 
 
 def _bead_table(
@@ -191,9 +206,7 @@ def _cell(figure: float | None, share: float | None) -> str:
 
 
 def write_figure4(calibration: Calibration, path: Path) -> None:
-    """Mean error over the stiffness for each radius, fitted and held out; quartics with a ring at the
-    minimum.
-    """
+    """Mean error over the stiffness for each radius, fitted and held out; quartics, a ring at the least."""
     fitted, held_out = [], []
     for colour, radius in zip(_colours(calibration), calibration.trials, strict=True):
         trials = sorted(calibration.trials[radius], key=lambda trial: trial.setup.tissue.stiffness)

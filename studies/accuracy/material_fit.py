@@ -104,9 +104,7 @@ class MaterialFit:
 
 
 def parameters_of(cases: Sequence[BeadCase]) -> list[Fitted]:
-    """What is estimated: modulus and Poisson's ratio outside the parts, the modulus of each part,
-    friction.
-    """
+    """What is estimated: modulus and Poisson's ratio outside the parts, each part's modulus, friction."""
     table = mechanical_properties().parts
     moduli = {"modulus": table["kidney"].young_kpa}
     for name in dict.fromkeys(part.name for case in cases for part in case.parts):
@@ -203,9 +201,7 @@ class _Search:
 
 
 def residuals_of(case: BeadCase, setup: Setup, values: dict[str, float]) -> np.ndarray:
-    """Residuals of one case: beads in units of BEAD_MM, then known forces in units of what they are known
-    to.
-    """
+    """Residuals of one case: beads in units of BEAD_MM, then known forces in those of their uncertainty."""
     usual = setup.but(young_kpa=15.0, poisson=0.45)
     key = "material fit", case.digest, setup.size_mm
     experiment = built_once(key, lambda: BeadExperiment(case, usual))

@@ -112,9 +112,7 @@ def computed_oscillation(beam: Cantilever, trace: np.ndarray) -> Oscillation:
 
 
 def mean_length(displacement_mm: np.ndarray) -> float:
-    """Mean length [mm] of the markers' displacements (n, 3); independent of the frames of capture and
-    beam.
-    """
+    """Mean length [mm] of the markers' displacements (n, 3), which is the same in any frame."""
     return float(np.linalg.norm(displacement_mm, axis=1).mean())
 
 

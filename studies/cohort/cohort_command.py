@@ -45,7 +45,9 @@ class CohortPatient:
 @study_command(
     "cohort",
     paths_argument("folders", "FOLDER...", required=True),
-    click.option("--quality", type=click.Choice(QUALITIES), help="A preset of the model [each scene's]."),
+    click.option(
+        "--quality", type=click.Choice(QUALITIES), help="A preset of the tissue model [each scene's]."
+    ),
     trials_option,
     has_workers=True,
 )

@@ -124,7 +124,7 @@ def _inner_width(phantom: EchoPhantom, text: str, scanline: int, depth_mm: float
 
 
 def elevation_curve(phantom: EchoPhantom, depth_mm: float, step_mm: np.ndarray) -> np.ndarray:
-    """Return how speckle intensity at a depth correlates with that of planes some steps away."""
+    """How speckle intensity at a depth correlates with that of planes some steps away."""
     phantom.fill(backscatter=0.1)
     part = np.abs(phantom.depth_mm - depth_mm) < 0.05 * phantom.probe.depth_mm
     curves = []
@@ -217,9 +217,7 @@ def interfaces(phantom: EchoPhantom, name: str) -> Iterator[Row]:
 
 
 def cysts(phantom: EchoPhantom, name: str) -> Iterator[Row]:
-    """Level in the middle of an anechoic cylinder across the image plane, relative to the tissue around
-    it.
-    """
+    """Level in an anechoic cylinder across the image plane, relative to the tissue around it."""
     beam, draw, count = _beam(phantom.probe, False), np.random.default_rng(SEED), CYST_POINTS
     middle = phantom.probe.number_of_scanlines // 2
     for depth in DEPTHS_MM[name]:

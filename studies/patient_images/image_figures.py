@@ -23,7 +23,7 @@ LEAST_PIXELS = 200
 
 
 def picture_figures(scans: Sequence[PlaneScan]) -> dict[str, float]:
-    """Return figures pooled over the planes of a patient and a probe.
+    """Figures pooled over the planes of a patient and a probe.
 
     ``fat_auc`` and ``surroundings_auc``: areas under the ROC curve of "brighter than kidney"
     (``PictureTruth``) of the averaged picture. ``grey_median`` and ``grey_p90`` of all that the scanlines
@@ -47,9 +47,7 @@ def picture_figures(scans: Sequence[PlaneScan]) -> dict[str, float]:
 
 
 def outline_dice(scan: PlaneScan) -> tuple[float, float]:
-    """Return Dice of the segmenter's outline of the kidney, and of one that sees no picture, in what is
-    seen.
-    """
+    """Dice of the segmenter's outline of the kidney, and of one that sees no picture, in what is seen."""
     seen = scan.truth.seen
     contour = kidney_contour(scan.truth.kidney & scan.covered, scan.pixel_mm) & scan.covered
     centre = np.argwhere(contour & seen).mean(axis=0)
@@ -59,8 +57,8 @@ def outline_dice(scan: PlaneScan) -> tuple[float, float]:
 
 
 def roc_area(brighter: np.ndarray, darker: np.ndarray) -> float:
-    """Return the area under the ROC curve of "brighter" (n,) above "darker" (m,), ties one half; NaN of
-    fewer than LEAST_PIXELS.
+    """Area under the ROC curve of "brighter" (n,) above "darker" (m,), ties one half; NaN of fewer than
+    LEAST_PIXELS.
     """
     if min(len(brighter), len(darker)) < LEAST_PIXELS:
         return float("nan")
@@ -89,12 +87,12 @@ BIN_MM, LEAST_SAMPLES = 2.0, 30
 
 
 def decibel(power: float) -> float:
-    """Return a power in dB; NaN of none."""
+    """A power in dB; NaN of none."""
     return float(10 * np.log10(power)) if power > 0 else float("nan")
 
 
 def capsule_figures(truths: Sequence[ScanlineTruth]) -> dict[str, float]:
-    """Return how much the capsule's echo is above the kidney beneath it [dB], where the beam meets it within
+    """How much the capsule's echo is above the kidney beneath it [dB], where the beam meets it within
     SQUARE_DEG and ASLANT_DEG.
 
     On each scanline that crosses the organ's surface into labelled kidney deeper than DEPTHS_MM[0]: the
@@ -116,8 +114,8 @@ def capsule_figures(truths: Sequence[ScanlineTruth]) -> dict[str, float]:
 
 
 def _crossings(truth: ScanlineTruth) -> np.ndarray:
-    """Return of each crossing of the surface (n, 4) the incidence [degrees], and the powers: greatest,
-    greatest of the control, mean inside.
+    """Of each crossing of the surface (n, 4) the incidence [degrees], and the powers: greatest, greatest of
+    the control, mean inside.
     """
     rows = []
     inside = truth.surface_mm < 0
@@ -141,14 +139,14 @@ def _crossings(truth: ScanlineTruth) -> np.ndarray:
 
 
 def _first(where: np.ndarray) -> int:
-    """Return the first index (n,) where something is, or n."""
+    """First index (n,) where something is, or n."""
     return int(where.argmax()) if where.any() else len(where)
 
 
 def agent_figures(truths: Sequence[ScanlineTruth], patient: PatientTruth) -> dict[str, float]:
-    """Return levels [dB] of contrast agent in the collecting system, and of the parenchyma BEHIND_MM behind
-    it, both against parenchyma at like depth that has none before it; NaN where there is none, as in a kidney
-    that is not enhanced.
+    """Levels [dB] of contrast agent in the collecting system, and of the parenchyma BEHIND_MM behind it, both
+    against parenchyma at like depth that has none before it; NaN where there is none, as in a kidney that is
+    not enhanced.
 
     ``agent_db`` is below 0 where the agent is fluid; ``behind_agent_db`` is below 0 in a shadow, above 0
     where fluid enhances.
@@ -182,9 +180,7 @@ def _is_judged(truth: ScanlineTruth) -> np.ndarray:
 
 
 def _behind_agent_mm(truth: ScanlineTruth) -> np.ndarray:
-    """Return how far behind the last contrast agent before it a sample is [mm] (scanlines, samples);
-    infinite without.
-    """
+    """How far behind contrast agent a sample is [mm] (scanlines, samples); infinite without agent."""
     last = np.where(truth.agent_mm < 0, truth.depth_mm, -np.inf)
     return truth.depth_mm - np.maximum.accumulate(last, axis=1)
 
@@ -192,8 +188,8 @@ def _behind_agent_mm(truth: ScanlineTruth) -> np.ndarray:
 def level_at_like_depth(
     power: np.ndarray, depth_mm: np.ndarray, other_power: np.ndarray, other_depth_mm: np.ndarray
 ) -> float:
-    """Return the mean power (n,) of samples over that of others (m,) in the same bins of depth [dB], weighted
-    as the first are; NaN where no bin has LEAST_SAMPLES of both.
+    """Mean power (n,) of samples over that of others (m,) in the same bins of depth [dB], weighted as the
+    first are; NaN where no bin has LEAST_SAMPLES of both.
     """
     bins = [(depth // BIN_MM).astype(int) for depth in (depth_mm, other_depth_mm)]
     length = max((int(of_depth.max()) + 1 for of_depth in bins if len(of_depth)), default=1)

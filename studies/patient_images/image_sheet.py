@@ -64,9 +64,7 @@ def write_sheet(patient: ImagedPatient, scans: Sequence[PlaneScan], title: str, 
 
 
 def sheet_figure(patient: ImagedPatient, scans: Sequence[PlaneScan], title: str) -> "Figure":
-    """Return the sheet as a figure: a column for each plane; rows for CT, labels, classes and B-mode
-    image.
-    """
+    """The sheet as a figure: a column for each plane; rows for CT, labels, classes and B-mode image."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
@@ -95,21 +93,19 @@ def sheet_figure(patient: ImagedPatient, scans: Sequence[PlaneScan], title: str)
 
 
 def classes_of(patient: ImagedPatient, scan: PlaneScan) -> np.ndarray:
-    """Return the names of the classes (rows, columns) at a scan's pixels, "" where there is none."""
+    """Names of the classes (rows, columns) at a scan's pixels, "" where there is none."""
     voxels = patient.voxels
     return _names_at(voxels.labels, voxels.tissues, voxels.index_from_mm, scan)
 
 
 def labels_of(patient: ImagedPatient, scan: PlaneScan) -> np.ndarray:
-    """Return the names of the labels (rows, columns) at a scan's pixels, before what is not labelled is
-    classified.
-    """
+    """Names of the labels (rows, columns) at a scan's pixels, before what is not labelled is classified."""
     anatomy = patient.anatomy
     return _names_at(anatomy.labels, anatomy.tissues, anatomy.index_from_mm, scan)
 
 
 def coloured(names: np.ndarray) -> np.ndarray:
-    """Return the colours (rows, columns, 3) uint8 of the names of tissues (rows, columns)."""
+    """Colours (rows, columns, 3) uint8 of the names of tissues (rows, columns)."""
     known, index = np.unique(names, return_inverse=True)
     return np.array([COLOURS.get(name, UNCLASSIFIED) for name in known], np.uint8)[index.reshape(names.shape)]
 
@@ -119,7 +115,7 @@ def _hex(name: str) -> str:
 
 
 def _palette() -> Image.Image:
-    """Return an image with the palette of a sheet: grey values, and the colours of the classes."""
+    """An image with the palette of a sheet: grey values, and the colours of the classes."""
     greys = np.linspace(0, 255, GREY_VALUES).round().astype(int)
     palette = Image.new("P", (1, 1))
     palette.putpalette(
@@ -131,7 +127,7 @@ def _palette() -> Image.Image:
 def _names_at(
     labels: np.ndarray | None, tissues: Mapping[int, str], index_from_mm: np.ndarray, scan: PlaneScan
 ) -> np.ndarray:
-    """Return the tissues (rows, columns) of the voxels that the pixels of a scan are in."""
+    """Tissues (rows, columns) of the voxels that the pixels of a scan are in."""
     world = pixel_places(scan.probe, scan.b_mode.shape) @ scan.pose[:3, :2].T + scan.pose[:3, 3]
     at = np.rint(world @ index_from_mm[:3, :3].T + index_from_mm[:3, 3]).astype(int)
     assert labels is not None

@@ -35,8 +35,7 @@ BAND_MM = 4.0
 def standard_planes(
     organ: trimesh.Trimesh, hilum_mm: Sequence[float] | None, probe: Probe
 ) -> dict[str, np.ndarray]:
-    """Return the poses (4, 4) by name, PLUS's axes of a probe to patient (LPS, mm); the face touches the
-    organ at rest.
+    """Poses (4, 4) by name, PLUS's axes of a probe to patient (LPS, mm); the face touches the organ at rest.
 
     Front and back are those of the kidney itself, across its polar axis and its hilum; the side is opposite
     the hilum. Where no hilum is known, which of the two sides it is is not known either, and the plane of the
@@ -60,7 +59,7 @@ def standard_planes(
 
 
 def _directions(axes: KidneyAxes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return unit vectors (3,) to the upper pole, to the hilum and to the front."""
+    """Unit vectors (3,) to the upper pole, to the hilum and to the front."""
     if axes.hilar is not None and axes.anterior is not None:
         return axes.polar, axes.hilar, axes.anterior
     front = ANTERIOR - (ANTERIOR @ axes.polar) * axes.polar
@@ -71,9 +70,7 @@ def _directions(axes: KidneyAxes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _touching(
     organ: trimesh.Trimesh, probe: Probe, beam: np.ndarray, lateral: np.ndarray, through: np.ndarray
 ) -> np.ndarray:
-    """Return the pose (4, 4) whose face touches the organ, and whose central scanline passes through a
-    point (3,).
-    """
+    """Pose (4, 4) whose face touches the organ and whose central scanline meets a point (3,)."""
     pose = np.eye(4)
     pose[:3, :3] = np.column_stack([lateral, beam, np.cross(lateral, beam)])
     surface = (np.concatenate([organ.vertices, organ.triangles_center]) - through) @ pose[:3, :3]
@@ -130,7 +127,7 @@ class ImagedPatient:
 
     @classmethod
     def of(cls, scene: Scene, anatomy: LoadedAnatomy) -> "ImagedPatient":
-        """Return a patient with a CT whose kidney is labelled."""
+        """A patient with a CT whose kidney is labelled."""
         assert anatomy.ct is not None
         scanned = scanned_anatomy(anatomy.organ, anatomy.ct, anatomy, np.zeros(3), scene.image.atlas)
         return cls(scene, scanned, PatientTruth.of(scanned))

@@ -84,7 +84,7 @@ def patient_images(study: Study, patients: tuple[Path, ...], names: tuple[str, .
 
 
 def _loaded(path: Path) -> tuple[Scene, LoadedAnatomy]:
-    """Return a patient with CT and labels. Raises CommandError, SceneError, PatientError."""
+    """A patient with CT and labels. Raises CommandError, SceneError, PatientError."""
     scene, anatomy = load_patient(path)
     if anatomy.ct is None or anatomy.labels is None:
         raise CommandError(f"{path}: has no CT or no labels; expected both (anatomy.ct, anatomy.labels)")
@@ -108,7 +108,7 @@ def _rows(
 
 
 def _noise(name: str, probe: Probe) -> dict[str, str | float | None]:
-    """Return a row: speckle of cortex over noise [dB] by depth, and the depth at which it is 0 dB [mm]."""
+    """A row: speckle of cortex over noise [dB] by depth, and the depth at which it is 0 dB [mm]."""
     levels = {
         f"at_{depth:g}_mm_db": rounded(float(snr))
         for depth, snr in zip(NOISE_DEPTHS_MM, snr_db(probe, np.array(NOISE_DEPTHS_MM)), strict=True)

@@ -37,7 +37,7 @@ class Volume:
     outside: float
 
     def at(self, places: np.ndarray) -> np.ndarray:
-        """Return values (...) at places (..., 3) [mm], linear between voxels."""
+        """Values (...) at places (..., 3) [mm], linear between voxels."""
         at = places @ self.index_from_mm[:3, :3].T + self.index_from_mm[:3, 3]
         return ndimage.map_coordinates(
             self.values, np.moveaxis(at, -1, 0), order=1, cval=self.outside, output=np.float32
@@ -64,7 +64,7 @@ class PatientTruth:
 
     @classmethod
     def of(cls, anatomy: ScannedAnatomy) -> "PatientTruth":
-        """Return that of an anatomy whose kidney is labelled."""
+        """That of an anatomy whose kidney is labelled."""
         kidney = _labelled(anatomy, *KIDNEY, *LESIONS)
         parenchyma = _labelled(anatomy, *PARENCHYMA)
         median = float(np.median(anatomy.hu[parenchyma]))
@@ -84,9 +84,9 @@ class PatientTruth:
         )
 
     def hidden_from_mm(self, probe: Probe, world_from_plane: np.ndarray) -> np.ndarray:
-        """Return the depths (scanlines,) from which on gas, bone, a stone or the CT's border hides what a
-        probe at a pose (4, 4) shows; infinite where nothing does. Contrast agent hides nothing. What hides
-        one scanline hides SHADOW_SCANLINES beside it.
+        """Depths (scanlines,) from which on gas, bone, a stone or the CT's border hides what a probe at a
+        pose (4, 4) shows; infinite where nothing does. Contrast agent hides nothing. What hides one scanline
+        hides SHADOW_SCANLINES beside it.
         """
         depth = sample_depths(probe)
         places = on_scanlines(probe, world_from_plane, depth)
@@ -99,14 +99,13 @@ class PatientTruth:
 
 
 def _labelled(anatomy: ScannedAnatomy, *tissues: str) -> np.ndarray:
-    """Return whether the label of a voxel is one of some tissues."""
+    """Whether the label of a voxel is one of some tissues."""
     assert anatomy.labels is not None
     return np.isin(anatomy.labels, [value for value, tissue in anatomy.tissues.items() if tissue in tissues])
 
 
 def contrast_agent(hu: np.ndarray, kidney: np.ndarray, median_hu: float) -> np.ndarray:
-    """Return the mask of contrast agent in the collecting system of a kidney: dense pieces that begin inside
-    its mask.
+    """Mask of contrast agent in the collecting system of a kidney: dense pieces that begin inside its mask.
 
     None in a kidney that is not enhanced, where dense pieces are stones.
     """
@@ -117,9 +116,8 @@ def contrast_agent(hu: np.ndarray, kidney: np.ndarray, median_hu: float) -> np.n
 
 
 def signed_distance_of(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Return distances [mm] from a mask, negative inside, whose zero is halfway between voxels (Raya & Udupa
-    1990, IEEE Trans Med Imaging 9, 32: between thick slices its contour has no stairs); FAR_MM where it is
-    empty.
+    """Distances [mm] from a mask, negative inside, whose zero is halfway between voxels (Raya & Udupa 1990,
+    IEEE Trans Med Imaging 9, 32: between thick slices its contour has no stairs); FAR_MM where it is empty.
     """
     if not mask.any():
         return np.full(mask.shape, FAR_MM, np.float32)
@@ -128,7 +126,7 @@ def signed_distance_of(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
 
 
 def surface_distance(surface: trimesh.Trimesh) -> Volume:
-    """Return signed distances [mm] from a closed surface, negative inside, around it; FAR_MM beyond."""
+    """Signed distances [mm] from a closed surface, negative inside, around it; FAR_MM beyond."""
     distance, low = distance_grid(surface.vertices, surface.faces, SURFACE_MM, SURFACE_REACH_MM)
     from_mm = np.diag([*[1 / SURFACE_MM] * 3, 1.0])
     from_mm[:3, 3] = -low / SURFACE_MM
@@ -136,12 +134,12 @@ def surface_distance(surface: trimesh.Trimesh) -> Volume:
 
 
 def sample_depths(probe: Probe) -> np.ndarray:
-    """Return the depths (samples,) [mm] at which the samples of a scanline are shown."""
+    """Depths (samples,) [mm] at which the samples of a scanline are shown."""
     return (np.arange(probe.number_of_samples_per_scanline) + 0.5) * probe.sample_mm
 
 
 def on_scanlines(probe: Probe, world_from_plane: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
-    """Return places (scanlines, n, 3) [mm] at depths (n,) along the scanlines of a probe at a pose (4, 4)."""
+    """Places (scanlines, n, 3) [mm] at depths (n,) along the scanlines of a probe at a pose (4, 4)."""
     start, direction = probe.scanlines()
     place = start[:, None] + depth_mm[:, None] * direction[:, None]
     return place @ world_from_plane[:3, :2].T + world_from_plane[:3, 3]
@@ -174,7 +172,7 @@ class PictureTruth:
 def picture_truth(
     patient: PatientTruth, probe: Probe, world_from_plane: np.ndarray, shape: tuple[int, int]
 ) -> PictureTruth:
-    """Return the truth of an image of a shape (rows, columns) at a pose (4, 4)."""
+    """The truth of an image of a shape (rows, columns) at a pose (4, 4)."""
     place = pixel_places(probe, shape)
     world = place @ world_from_plane[:3, :2].T + world_from_plane[:3, 3]
     hu, distance = patient.hu.at(world), patient.kidney_mm.at(world)
@@ -191,7 +189,7 @@ def picture_truth(
 
 
 def pixel_places(probe: Probe, shape: tuple[int, int]) -> np.ndarray:
-    """Return places (rows, columns, 2) (u, v) [mm] of the centres of an image's pixels."""
+    """Places (rows, columns, 2) (u, v) [mm] of the centres of an image's pixels."""
     to_probe = probe.image_to_probe(*shape)
     u = np.arange(shape[1]) * to_probe[0, 0] + to_probe[0, 3]
     v = np.arange(shape[0]) * to_probe[1, 1] + to_probe[1, 3]
@@ -221,7 +219,7 @@ class ScanlineTruth:
 def scanline_truth(
     patient: PatientTruth, probe: Probe, world_from_plane: np.ndarray, bmode: BMode
 ) -> ScanlineTruth:
-    """Return the truth of the image that was rendered last, at a pose (4, 4)."""
+    """The truth of the image that was rendered last, at a pose (4, 4)."""
     depth, place = sample_depths(probe), rest_of_samples(bmode, probe)
     along = probe.scanlines()[1] @ world_from_plane[:3, :2].T
     return ScanlineTruth(
@@ -237,8 +235,8 @@ def scanline_truth(
 
 
 def rest_of_samples(bmode: BMode, probe: Probe) -> np.ndarray:
-    """Return where the tissue of each sample is at rest (scanlines, samples, 3) [mm]: the speed of sound
-    displaces what is shown.
+    """Where the tissue of each sample is at rest (scanlines, samples, 3) [mm]: the speed of sound displaces
+    what is shown.
     """
     at = (np.arange(bmode.samples) + 0.5) / bmode.sound.stride_of(probe)
     first = at.astype(int)
@@ -247,8 +245,8 @@ def rest_of_samples(bmode: BMode, probe: Probe) -> np.ndarray:
 
 
 def incidence_deg(patient: PatientTruth, place: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Return angles (scanlines, samples) between scanlines of directions (scanlines, 3) and the normal of
-    the organ's surface at places.
+    """Angles (scanlines, samples) between scanlines of directions (scanlines, 3) and the normal of the
+    organ's surface at places.
     """
     half = np.eye(3)
     normal = np.stack(

@@ -31,9 +31,7 @@ SEED = 20160101
 
 
 def write_whole_body(folder: Path, slices: int) -> Path:
-    """Write folder/ct, a DICOM series of 512 x 512 pixels, and folder/labels.nii.gz on the same grid;
-    return the folder.
-    """
+    """Write folder/ct, a DICOM series of 512 x 512 pixels, and folder/labels.nii.gz; return the folder."""
     ct, labels = make_phantom()
     centre = np.array(ct.TransformContinuousIndexToPhysicalPoint([n / 2 for n in ct.GetSize()]))
     span = (PIXELS - 1) * PIXEL_MM

@@ -23,12 +23,12 @@ from sim.device import start
 from studies.accuracy.bead_case import BeadCase, load_case
 from studies.accuracy.bead_errors import bead_errors
 from studies.accuracy.bead_experiment import BeadExperiment
+from studies.performance.step_timing import FRAME_MS
 from studies.study import CHOSEN, Results, Study, paths_argument, quick_option, study_command
 from studies.tables_and_panels import draw_panel, panels_of, table_of
 from ultrasound.probe_manipulator import poses_between
 
 EMBEDDED_CASE = Path(__file__).parents[1] / "reference" / "embedded"
-FRAME_MS = 1000 / 60
 COLUMNS = {
     "model": "{model}",
     "size, mm": "{size_mm:g}",

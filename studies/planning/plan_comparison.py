@@ -113,9 +113,7 @@ def compare(
 
 
 def with_tumour(anatomy: LoadedAnatomy, gravity: np.ndarray) -> LoadedAnatomy:
-    """The anatomy with a ball just under the highest point of its organ, unless it has a tumour of its
-    own.
-    """
+    """The anatomy with a ball just under the highest point of its organ, unless it has a tumour."""
     if anatomy.tumour is not None:
         return anatomy
     organ, up = anatomy.organ, -np.asarray(gravity) / np.linalg.norm(gravity)

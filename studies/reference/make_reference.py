@@ -103,9 +103,7 @@ def solved(
 
 
 def in_case_frame(surface: trimesh.Trimesh, gravity: np.ndarray, organ: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A surface in the frame of the files: z against gravity, x along the organ's length, its centre of
-    mass 0.
-    """
+    """A surface in the files' frame: z against gravity, x along the organ, the organ's centre of mass 0."""
     up = -np.asarray(gravity, float) / np.linalg.norm(gravity)
     length = np.linalg.svd(organ.vertices - organ.vertices.mean(axis=0), full_matrices=False)[2][0]
     x = length - (length @ up) * up

@@ -42,9 +42,7 @@ class CutCase:
 
 
 class CutBeadExperiment(BeadExperiment):
-    """A bead experiment on an organ from which tissue is removed: before it settles, or when the whole
-    organ has settled.
-    """
+    """A bead experiment on an organ from which tissue is removed, before or after the whole has settled."""
 
     def __init__(self, cut: CutCase, setup: Setup, settles_first: bool) -> None:
         super().__init__(cut.case, setup)

@@ -15,7 +15,7 @@ from rehearsal.result_files import rounded
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import EMBEDDED, Scene
 from sim.device import start
-from studies.harness import rehearsal_of, without_images
+from studies.harness import rehearsal_of, step_of, without_images
 from studies.resection.cut_balance import BALANCE_BAR_MM, COARSER_MM, EDGE_MM, balance_rows, joined
 from studies.resection.cut_times import REPEATS, ROUNDS, STEPS, cut_times
 from studies.resection.planned_cuts import MARGIN_BAR_MM, VOLUME_BAR, margin_rows
@@ -128,9 +128,7 @@ def _balance() -> Part:
     report = dict(
         bar_mm=BALANCE_BAR_MM,
         cell_mm=setup.size_mm,
-        time_step_s=step_s,
-        substeps=setup.substeps,
-        iterations=setup.iterations,
+        **step_of(setup),
         rows=described,
         to_coarser_mm=[rounded(value) for value in apart],
     )

@@ -16,9 +16,7 @@ from rehearsal.resection.judgement import NOT_PARENCHYMA
 
 @dataclass(frozen=True)
 class RasterGrid:
-    """Voxels of one width [mm]; ``low_mm`` (3,) is the centre of the first, ``count`` (3,) their number
-    along x, y, z.
-    """
+    """Voxels of one width [mm]: ``low_mm`` (3,) is the centre of the first, ``count`` (3,) their number."""
 
     low_mm: np.ndarray
     count: np.ndarray
@@ -44,9 +42,7 @@ class RasterGrid:
         return parity.reshape(self.count)
 
     def _crossings(self, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Columns (n,) and heights (n,) [mm] at which lines along z through the centres cross triangles
-        (f, 3, 3) [mm].
-        """
+        """Columns (n,) and heights (n,) [mm] at which the columns cross triangles (f, 3, 3) [mm]."""
         first = np.clip(np.ceil(corner[:, :, :2].min(axis=1) / self.voxel_mm), 0, None).astype(int)
         last = np.minimum(np.floor(corner[:, :, :2].max(axis=1) / self.voxel_mm), self.count[:2] - 1).astype(
             int
@@ -63,9 +59,7 @@ class RasterGrid:
 
 
 def _barycentric(triangle: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Shares (n, 3) of the corners of triangles (n, 3, 2) at points (n, 2); negative where a triangle is
-    seen edge on.
-    """
+    """Shares (n, 3) of the corners of triangles (n, 3, 2) at points (n, 2); negative of one on edge."""
     to = triangle - point[:, None]
     after, last = np.roll(to, -1, axis=1), np.roll(to, -2, axis=1)
     opposite = after[..., 0] * last[..., 1] - after[..., 1] * last[..., 0]

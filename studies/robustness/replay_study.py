@@ -155,8 +155,7 @@ def summary(figures: dict[str, Any]) -> str:
     lines = [
         f"recorded  {figures['minutes']:g} minutes, {figures['moments']} steps, {figures['ways_back']} of "
         f"them undone, redone, reset or returned to a bookmark; {figures['megabytes']:.1f} MB "
-        f"in {figures['file']}; "
-        f"final state {figures['digest']}"
+        f"in {figures['file']}; final state {figures['digest']}"
     ]
     for run in figures["replays"]:
         same = run["digest"] == figures["digest"] and run["differs_s"] is None

@@ -77,9 +77,7 @@ def cases_of(model: str) -> list[StressCase]:
 
 
 def quick_cases_of(model: str) -> list[StressCase]:
-    """The last case of each kind on the kidney, which is the hardest, and the first ones of a particle or
-    cell alone.
-    """
+    """The last and hardest case of each kind on the kidney, and the first of a particle or cell alone."""
     chosen: list[StressCase] = []
     for kind in dict.fromkeys(case.kind for case in cases_of(model)):
         of_kind = [case for case in cases_of(model) if case.kind == kind]

@@ -93,9 +93,7 @@ def _run_all(model: str, cases: list[StressCase]) -> list[dict[str, Any]]:
 
 
 class Extremes:
-    """Extreme values over a whole stress test, and the messages of the divergence check where it restored
-    the state.
-    """
+    """Extreme values over a whole stress test, and the messages of the divergence check."""
 
     def __init__(self, specimen: Specimen) -> None:
         self.specimen = specimen
@@ -180,9 +178,7 @@ def _apply(specimen: Specimen, case: StressCase, extremes: Extremes) -> None:
 
 
 def _set_material(specimen: Specimen, heaviest: float, material: Mapping[str, float]) -> None:
-    """Multiply the mass of the middle node and change the material; shape matching has its mass ratio from
-    the start.
-    """
+    """Change the middle node's mass and the material; shape matching has its mass ratio from the start."""
     if isinstance(specimen.model, NeoHookean):
         mass = specimen.mass.copy()
         mass[len(mass) // 2] *= heaviest

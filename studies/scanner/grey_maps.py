@@ -46,12 +46,12 @@ class GreyMap:
     linear_residual: float
 
     def power(self) -> np.ndarray:
-        """Return the grey (n,) of the fitted power."""
+        """Grey (n,) of the fitted power."""
         return self.scale * 10 ** (self.amplitude_db / 20 * self.exponent)
 
 
 def fitted_grey_map(amplitude: np.ndarray, grey: np.ndarray) -> GreyMap:
-    """Return the grey map of pixels (n,)."""
+    """Grey map of pixels (n,)."""
     used = (amplitude > 0) & (grey > FITTED_GREY[0]) & (grey < FITTED_GREY[1])
     decibel, grey = 20 * np.log10(amplitude[used]), grey[used]
     step = np.floor(decibel / STEP_DB).astype(int)
@@ -69,9 +69,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def curved_source(picture: np.ndarray, lines: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return scanline and sample, fractional, of each pixel of the curved array's picture, nan outside the
-    sector.
-    """
+    """Scanline and sample, fractional, of the pixels of the curved array's picture, nan beyond the sector."""
     row, column = np.indices(picture.shape)
     depth = RADIUS_MM + (row - FACE_PIXEL[0]) * PIXEL_MM
     # PLUS has the middle half a pixel to the left.
@@ -83,7 +81,7 @@ def curved_source(picture: np.ndarray, lines: int, samples: int) -> tuple[np.nda
 
 
 def linear_source(lines: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return scanline and sample of each pixel of the linear array's image, each (rows, columns)."""
+    """Scanline and sample of each pixel of the linear array's image, each (rows, columns)."""
     rows = np.arange(LINEAR_ROWS.stop - LINEAR_ROWS.start)
     columns = np.arange(LINEAR_COLUMNS.stop - LINEAR_COLUMNS.start)
     sample = LINEAR_FIRST_SAMPLE + LINEAR_SAMPLES_PER_ROW * rows
@@ -93,7 +91,7 @@ def linear_source(lines: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def root_at(amplitude: np.ndarray, line: np.ndarray, sample: np.ndarray) -> np.ndarray:
-    """Return amplitudes at fractional scanlines and samples.
+    """Amplitudes at fractional scanlines and samples.
 
     Interpolated is the fourth root, whose speckle has no deep gaps.
     """
@@ -101,8 +99,8 @@ def root_at(amplitude: np.ndarray, line: np.ndarray, sample: np.ndarray) -> np.n
 
 
 def our_picture(amplitude: np.ndarray, phantom: EchoPhantom) -> np.ndarray:
-    """Return the picture (rows, columns) uint8 that our log compression and scan conversion make of recorded
-    amplitudes (scanlines, samples) of the phantom's probe.
+    """Picture (rows, columns) uint8 that our log compression and scan conversion make of recorded amplitudes
+    (scanlines, samples) of the phantom's probe.
     """
     probe = phantom.probe.model_copy(update={"dyn_range_db": DYNAMIC_RANGE_DB, "grey_map": "linear"})
     phantom.amplitude(probe=probe)
@@ -113,7 +111,7 @@ def our_picture(amplitude: np.ndarray, phantom: EchoPhantom) -> np.ndarray:
 
 
 def on_pixels_of(ours: np.ndarray, phantom: EchoPhantom, picture: np.ndarray) -> np.ndarray:
-    """Return our picture of the curved array at the pixels of PLUS's, 0 outside."""
+    """Our picture of the curved array at the pixels of PLUS's, 0 outside."""
     width, depth, above = phantom.probe.extent_mm
     row, column = np.indices(picture.shape)
     v, u = (row - FACE_PIXEL[0]) * PIXEL_MM, (column - FACE_PIXEL[1] + 0.5) * PIXEL_MM
@@ -122,7 +120,7 @@ def on_pixels_of(ours: np.ndarray, phantom: EchoPhantom, picture: np.ndarray) ->
 
 
 def map_lines(name: str, grey_map: GreyMap) -> list[ScannerRow]:
-    """Return the lines of the table of a grey map."""
+    """Lines of the table of a grey map."""
     note = "PLUS's map, not the scanner's: grey = scale amplitude^exponent"
     slope = f"{grey_map.slope:.2f} grey per dB"
     return rows_of(
@@ -135,6 +133,6 @@ def map_lines(name: str, grey_map: GreyMap) -> list[ScannerRow]:
 
 
 def histogram_lines(name: str, image: np.ndarray, note: str = "") -> list[ScannerRow]:
-    """Return median and 90th percentile of a picture's part."""
+    """Median and 90th percentile of a picture's part."""
     figures = zip(("median", "90th percentile"), grey_figures(image), strict=True)
     return rows_of(PART, *((f"{name}: {figure}", value, None, "grey", note) for figure, value in figures))

@@ -38,7 +38,7 @@ class SpeckleRegion(NamedTuple):
     samples: slice
 
     def of(self, signal: np.ndarray) -> np.ndarray:
-        """Return its part of a signal (scanlines, samples)."""
+        """Its part of a signal (scanlines, samples)."""
         return signal[self.scanlines, self.samples]
 
 
@@ -53,7 +53,7 @@ INSIDE, OUTSIDE = SpeckleRegion("dark", slice(265, 300), slice(310, 390)), SPECK
 
 
 def probe_of(recorded_samples: int) -> Probe:
-    """Return a probe with the geometry of the recording, where its scanlines have so many samples."""
+    """A probe with the geometry of the recording, where its scanlines have so many samples."""
     # PLUS counts the sector between the outermost scanlines, we between the outer edges of these.
     half_deg = HALF_SECTOR_DEG * LINES / (LINES - 1)
     return Probe(
@@ -72,13 +72,13 @@ def probe_of(recorded_samples: int) -> Probe:
 
 
 def our_speckle(phantom: EchoPhantom) -> list[np.ndarray]:
-    """Return amplitudes (scanlines, samples) of even tissue, at several places."""
+    """Amplitudes (scanlines, samples) of even tissue, at several places."""
     phantom.fill(backscatter=0.1)
     return [phantom.amplitude(at) for at in np.random.default_rng(SEED).uniform(-200, 200, DRAWS)]
 
 
 def _figures(probe: Probe, region: SpeckleRegion, amplitudes: list[np.ndarray]) -> tuple[float, float, float]:
-    """Return SNR, lateral and axial correlation length [mm] of a region, the means over images."""
+    """SNR, lateral and axial correlation length [mm] of a region, the means over images."""
     parts = [without_depth_trend(region.of(amplitude)) for amplitude in amplitudes]
     depth_mm = (region.samples.start + region.samples.stop) / 2 * probe.sample_mm
     spacing = float(probe.line_spacing_mm(np.array([depth_mm]))[0])
@@ -88,9 +88,7 @@ def _figures(probe: Probe, region: SpeckleRegion, amplitudes: list[np.ndarray]) 
 
 
 def measurements(iq: np.ndarray, phantom: EchoPhantom) -> list[ScannerRow]:
-    """Return the lines of the table, of the recorded IQ signal (scanlines, samples) and our images of a
-    like probe.
-    """
+    """Lines of the table, of the recorded IQ signal (scanlines, samples) and our images of a like probe."""
     probe, amplitude, simulated = phantom.probe, np.abs(iq), our_speckle(phantom)
     ours = f"ours: {FREQUENCY_MHZ:g} MHz, {probe.bandwidth_percent:g} %, f/{probe.f_number:g}"
     not_stated = f"{ours}; the recording's are not stated"

@@ -16,9 +16,7 @@ from errors import UserError
 
 @dataclass(frozen=True)
 class ScannerRow:
-    """A quantity: of the recording, ours beside it where there is one, its unit, and what has to be known
-    of it.
-    """
+    """A quantity: of the recording, ours beside it if there is one, its unit, what to know of it."""
 
     part: str
     quantity: str
@@ -51,9 +49,7 @@ class RecordingError(UserError):
 
 @dataclass(frozen=True)
 class ChannelData:
-    """Echoes of plane waves, ``rf`` (samples, elements, firings), as PyMUST's PWI_disk.mat has them; SI
-    units.
-    """
+    """Echoes of plane waves, ``rf`` (samples, elements, firings), as in PyMUST's PWI_disk.mat; SI units."""
 
     rf: np.ndarray
     sampling_hz: float
@@ -66,8 +62,8 @@ class ChannelData:
 
 
 def read_iq(path: Path) -> np.ndarray:
-    """Return the IQ signal (scanlines, samples) complex128 of a PLUS recording, from the array downwards.
-    Raises RecordingError.
+    """IQ signal (scanlines, samples) complex128 of a PLUS recording, from the array downwards. Raises
+    RecordingError.
 
     PLUS stores I and Q of a sample side by side (RF_IQ_LINE), or a line of I and one of Q (RF_I_LINE_Q_LINE).
     """
@@ -85,12 +81,12 @@ def read_iq(path: Path) -> np.ndarray:
 
 
 def read_picture(path: Path) -> np.ndarray:
-    """Return a recording's picture (rows, columns) float64. Raises RecordingError."""
+    """A recording's picture (rows, columns) float64. Raises RecordingError."""
     return sitk.GetArrayFromImage(_read(path)).astype(float).squeeze()
 
 
 def read_channel_data(path: Path) -> ChannelData:
-    """Return PyMUST's rotating disc. Raises RecordingError."""
+    """PyMUST's rotating disc. Raises RecordingError."""
     try:
         content = loadmat(path, squeeze_me=True)
         rf, fields = content["RF"].astype(float), content["param"]

@@ -43,13 +43,13 @@ class RingDown:
     noise_db: float
 
     def fitted_db(self, depth: np.ndarray) -> np.ndarray:
-        """Return the law's level [dB] at depths in wavelengths."""
+        """Law's level [dB] at depths in wavelengths."""
         return _law_db((self.start_db, self.fall, self.lens, self.phase, self.bands), depth, self.noise_db)
 
 
 def carrier_of(iq: np.ndarray) -> float:
-    """Return the frequency [cycles per sample] of which the delay from I to Q (scanlines, samples) is a
-    quarter of the period.
+    """Frequency [cycles per sample] of which the delay from I to Q (scanlines, samples) is a quarter of the
+    period.
 
     The delay is the slope of the phase of their cross-spectrum over frequency.
     """
@@ -65,9 +65,7 @@ def carrier_of(iq: np.ndarray) -> float:
 
 
 def fitted_ring_down(iq: np.ndarray, fitted: slice = FITTED, noise: slice = NOISE) -> RingDown:
-    """Return the law that fits the IQ signal (scanlines, samples) of an array in air best, robustly, in
-    dB.
-    """
+    """Law that fits the IQ signal (scanlines, samples) of an array in air best, robustly, in dB."""
     carrier = carrier_of(iq[:, fitted])
     depth = (np.arange(iq.shape[1]) + 0.5) * carrier / 2
     power = np.convolve((np.abs(iq) ** 2).mean(axis=0), np.ones(AVERAGED) / AVERAGED, "same")
@@ -91,7 +89,7 @@ def _law_db(law: "np.ndarray | tuple[float, ...]", depth: np.ndarray, noise_db: 
 
 
 def measurements(ring: RingDown, probe: Probe) -> list[ScannerRow]:
-    """Return the lines of the table; ours beside them, the level above the noise that of a probe."""
+    """Lines of the table; ours beside them, the level above the noise that of a probe."""
     ours_db = probe.ringing_db + MORE_IN_AIR_DB - probe.noise_before_gain_db
     visible = float(ring.depth[FITTED][np.flatnonzero(ring.level_db[FITTED] > ring.noise_db + 6)[-1]])
     clips = "extrapolated: nearer than 12 wavelengths the recording clips"

@@ -44,9 +44,7 @@ class Rotation:
 
 
 def probe_of(data: ChannelData) -> Probe:
-    """Return a probe with the array of the recording, whose velocity scale is the limit of its pulse
-    repetition.
-    """
+    """A probe with the array of the recording, whose velocity scale is the limit of its pulse repetition."""
     width_mm = 1e3 * data.pitch_m * data.rf.shape[1]
     return Probe(
         transducer_name="recorded array",
@@ -62,7 +60,7 @@ def probe_of(data: ChannelData) -> Probe:
 
 
 def beamformed(data: ChannelData, x_m: np.ndarray, z_m: np.ndarray) -> np.ndarray:
-    """Return the IQ signal (x, z, firings) by delay and sum, 0 beyond the recorded depths.
+    """IQ signal (x, z, firings) by delay and sum, 0 beyond the recorded depths.
 
     Raises EchoStudyError without pymust.
     """
@@ -83,8 +81,8 @@ def beamformed(data: ChannelData, x_m: np.ndarray, z_m: np.ndarray) -> np.ndarra
 
 
 def our_velocity(phantom: EchoPhantom, iq: np.ndarray) -> np.ndarray:
-    """Return the velocity away from the array [m/s] (scanlines, tissue samples) that our sample volume and
-    phase make of an ensemble of IQ (scanlines, tissue samples, firings) of the phantom's probe.
+    """Velocity away from the array [m/s] (scanlines, tissue samples) that our sample volume and phase make of
+    an ensemble of IQ (scanlines, tissue samples, firings) of the phantom's probe.
     """
     phantom.fill()
     phantom.amplitude()
@@ -94,14 +92,14 @@ def our_velocity(phantom: EchoPhantom, iq: np.ndarray) -> np.ndarray:
 
 
 def fitted_rotation(x_m: np.ndarray, z_m: np.ndarray, velocity_m_s: np.ndarray) -> Rotation:
-    """Return the rotation that fits best, by least squares, points (n,)."""
+    """Rotation that fits best, by least squares, points (n,)."""
     system = np.column_stack([np.ones_like(x_m), x_m, z_m])
     offset, slope, depth_slope = np.linalg.lstsq(system, velocity_m_s, rcond=None)[0]
     return Rotation(float(offset), float(slope), float(depth_slope), x_m, z_m, velocity_m_s)
 
 
 def disc_of(energy: np.ndarray, x_m: np.ndarray, z_m: np.ndarray) -> np.ndarray:
-    """Return which points of a grid, energy (x, z), are in the inner part of a bright disc."""
+    """Which points of a grid, energy (x, z), are in the inner part of a bright disc."""
     x, z = np.meshgrid(x_m, z_m, indexing="ij")
     bright = (energy > energy.max() * 10 ** (LEAST_ENERGY_DB / 10)) & _is_recorded(z)
     area = bright.sum() * (x_m[1] - x_m[0]) * (z_m[1] - z_m[0])
@@ -114,7 +112,7 @@ def _is_recorded(z_m: np.ndarray) -> np.ndarray:
 
 
 def rotation_of(data: ChannelData) -> Rotation:
-    """Return the rotation that our Doppler finds in channel data. Taichi must run."""
+    """Rotation that our Doppler finds in channel data. Taichi must run."""
     phantom = EchoPhantom(probe_of(data))
     probe, sound = phantom.probe, phantom.bmode.sound
     x_m = probe.elements()[:, 0] / 1e3
@@ -129,7 +127,7 @@ def rotation_of(data: ChannelData) -> Rotation:
 
 
 def measurements(rotation: Rotation) -> list[ScannerRow]:
-    """Return the lines of the table; beside ours is an independent evaluation of the same recording."""
+    """Lines of the table; beside ours is an independent evaluation of the same recording."""
     residual = 1e3 * float(np.median(np.abs(rotation.residual_m_s)))
     slope, depth_slope = rotation.slope_per_s, rotation.depth_slope_per_s
     note = "recorded: an independent evaluation; ours: our Doppler"

@@ -84,7 +84,7 @@ def scanner(study: Study, data: Path) -> Results:
 
 
 def figure_of(panels: list[Panel]) -> "Figure":
-    """Return one figure of all panels."""
+    """One figure of all panels."""
     rows = -(-len(panels) // 2)
     figure, grid = panels_of((12, 4.6 * rows), rows, 2)
     for axes, panel in zip_longest(grid.flat, panels):

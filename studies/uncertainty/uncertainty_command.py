@@ -40,9 +40,7 @@ LEAST_BAND = 0.05
 
 
 def samples_of(unknowns: Sequence[Unknown], base: int) -> list[dict[str, float]]:
-    """Quasi-random values (Saltelli's scheme on Sobol's sequence): ``base`` times the number of parameters
-    and two.
-    """
+    """Quasi-random values (Saltelli's scheme, Sobol's sequence): ``base`` times the parameters and two."""
     shares = sobol_sample.sample(_problem(unknowns), base, calc_second_order=False, seed=SEED)
     return [
         {unknown.name: float(unknown.value(share)) for unknown, share in zip(unknowns, row, strict=True)}
@@ -51,9 +49,7 @@ def samples_of(unknowns: Sequence[Unknown], base: int) -> list[dict[str, float]]
 
 
 def bands_of(outcomes: np.ndarray) -> list[dict[str, Any]]:
-    """At each depth the band of each quantity: 5th, 50th and 95th percentile, from outcomes (samples,
-    depths, 9).
-    """
+    """At each depth the 5th, 50th and 95th percentile of each quantity, of outcomes (samples, depths, 9)."""
     rows = []
     for depth in range(outcomes.shape[1]):
         values = outcomes[:, depth]
@@ -71,9 +67,7 @@ def _band(values: np.ndarray) -> dict[str, float]:
 
 
 def indices_of(unknowns: Sequence[Unknown], outcomes: np.ndarray) -> dict[str, dict[str, dict[str, float]]]:
-    """Total Sobol indices of each quantity at the greatest depth, by parameter, with their 95 %
-    confidence.
-    """
+    """Total Sobol indices of each quantity at the greatest depth, by parameter, with 95 % confidence."""
     indices = {}
     for n, name in enumerate(QUANTITIES):
         values = outcomes[:, -1, n]
@@ -178,7 +172,7 @@ def _in_window(out: Path) -> str:
 
 
 def report_of(outcomes: np.ndarray, unknowns: list[Unknown], depths_mm: tuple[float, ...]) -> dict[str, Any]:
-    """The figures of uncertainty.json, from outcomes (samples, depths, 9)."""
+    """The figures of uncertainty.json, of outcomes (samples, depths, 9)."""
     return dict(
         indentations_mm=list(depths_mm),
         parameters=[
