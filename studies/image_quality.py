@@ -24,11 +24,16 @@ def correlation_length(amplitude: np.ndarray, axis: int) -> float:
     curve = [
         np.mean(intensity[: len(intensity) - lag] * intensity[lag:]) for lag in range(len(intensity) // 2)
     ]
-    share = np.array(curve) / curve[0]
-    if not (share < 0.5).any():
+    return first_at(np.arange(len(curve)), np.array(curve) / curve[0], 0.5)
+
+
+def first_at(place: np.ndarray, values: np.ndarray, level: float) -> float:
+    """The first place (n,) at which falling values (n,) reach a level, linear in between; nan if never."""
+    below = np.flatnonzero(values <= level)
+    if len(below) == 0:
         return float("nan")
-    below = int(np.argmax(share < 0.5))
-    return float(np.interp(-0.5, -share[below - 1 : below + 1], [below - 1, below]))
+    around = slice(max(int(below[0]) - 1, 0), int(below[0]) + 1)
+    return float(np.interp(-level, -values[around], place[around]))
 
 
 def without_depth_trend(amplitude: np.ndarray) -> np.ndarray:
@@ -82,9 +87,4 @@ def snr_db(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
 def depth_of_noise_mm(probe: Probe) -> float:
     """Depth at which speckle of cortex has the level of the noise [mm]; NaN if deeper than DEEPEST_MM."""
     depth = np.arange(0.0, DEEPEST_MM, STEP_MM)
-    snr = snr_db(probe, depth)
-    below = np.flatnonzero(snr <= 0)
-    if len(below) == 0:
-        return float("nan")
-    last = int(below[0])
-    return float(np.interp(0.0, -snr[max(last - 1, 0) : last + 1], depth[max(last - 1, 0) : last + 1]))
+    return first_at(depth, snr_db(probe, depth), 0.0)

@@ -184,8 +184,8 @@ def _bands(distances: np.ndarray, errors: np.ndarray) -> list[str]:
     """Mean errors in bands of distance that hold equally many beads."""
     order = np.argsort(distances, kind="stable")
     return [
-        f"  {distances[band].min():5.1f} to {distances[band].max():5.1f} mm  {errors[band].mean():5.2f} mm on "
-        f"average, {errors[band].max():5.2f} at most ({len(band)} bead positions)"
+        f"  {distances[band].min():5.1f} to {distances[band].max():5.1f} mm  {errors[band].mean():5.2f} mm "
+        f"on average, {errors[band].max():5.2f} at most ({len(band)} bead positions)"
         for band in np.array_split(order, DISTANCE_BANDS)
         if len(band)
     ]

@@ -132,7 +132,7 @@ class SimusBeam:
     def _in_aperture(
         self, points: np.ndarray, chosen: np.ndarray, middle: float, focus_mm: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
-        """The x, y, z of points, focus (2,) and elements (e, 2) in SIMUS's axes of an aperture; its radius."""
+        """Points x, y, z, focus (2,) and elements (e, 2) in SIMUS's axes of an aperture, its radius."""
         x, y, z = points.T.astype(float)
         radius = self.probe.radius_mm
         if not radius:

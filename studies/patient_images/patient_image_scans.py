@@ -20,7 +20,6 @@ from studies.patient_images.patient_truth import (
     picture_truth,
     scanline_truth,
 )
-from ultrasound.acoustics import TissueVoxels
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import ImagePlane
 from ultrasound.scanned_anatomy import ScannedAnatomy
@@ -131,11 +130,6 @@ class ImagedPatient:
         assert anatomy.ct is not None
         scanned = scanned_anatomy(anatomy.organ, anatomy.ct, anatomy, np.zeros(3), scene.image.atlas)
         return cls(scene, scanned, PatientTruth.of(scanned))
-
-    @property
-    def voxels(self) -> TissueVoxels:
-        """The tissue of each voxel, as classified."""
-        return self.anatomy.voxels
 
     def scans(self, probe: Probe) -> Iterator[PlaneScan]:
         """Yield the scans of the standard planes, at rest, with default settings."""

@@ -12,7 +12,6 @@ import trimesh
 from skfem import MeshTet2
 
 from scenes.surfaces import signed_distance_from
-from sim.stored_arrays import stored
 from studies.reference.fem_press import FemExperiment, FemPress
 from studies.reference.fem_solid import FemMaterial
 from studies.reference.reference_case import ReferenceCase
@@ -23,14 +22,6 @@ BEADS, BEAD_DEPTH_MM, BEAD_SEED, CANDIDATES_A_BEAD = 45, 3.0, 20160705, 10
 # Edges far from the transducer are longer; Mmg makes them shorter where the surface is round.
 GROWTH, BULK_OF_NEAR = 1.0, 5.0
 COARSER = 1.4
-
-
-def graded_mesh(kidney: trimesh.Trimesh, press: FemPress, near_mm: float) -> MeshTet2:
-    """Tetrahedra that fill the kidney, with edges of ``near_mm`` where the transducer touches it.
-
-    Raises MeshError.
-    """
-    return tetrahedra(kidney, size_around(kidney, press, near_mm))
 
 
 def size_around(
@@ -88,7 +79,7 @@ def solved(
     """The experiment on one mesh; surfaces and beads (n, 3) in the frame of the files [mm]."""
     start = perf_counter()
     press = FemPress()
-    mesh = graded_mesh(kidney, press, near_mm)
+    mesh = tetrahedra(kidney, size_around(kidney, press, near_mm))
     report(f"{mesh.nelements} tetrahedra, {mesh.doflocs.shape[1]} nodes")
     experiment = FemExperiment(mesh, support, FemMaterial(), press, report)
     stages = list(experiment.stages())
@@ -137,11 +128,11 @@ def pressed_beads(
     beads: np.ndarray,
     near_mm: float,
     indentations_mm: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Solve, or read what was solved before: it takes half an hour for edges of 4 mm.
+) -> tuple[np.ndarray, ...]:
+    """Beads in an organ with a crater; it takes half an hour for edges of 4 mm: store the result.
 
     Args:
-        organ: its closed surface, in the frame of ``make_reference.in_case_frame`` [mm].
+        organ: its closed surface, in the frame of ``in_case_frame`` [mm].
         bed: the faces of the crater, which have edges of ``near_mm`` as the tissue by the transducer has.
         support: closed surface [mm].
         beads: places at rest [mm], shape (n, 3).
@@ -156,18 +147,6 @@ def pressed_beads(
         MeshError: no mesh fills the organ.
         NotConvergedError: no equilibrium was found.
     """
-    moved, at, force = stored(_solved, organ, bed, support, beads, near_mm, np.asarray(indentations_mm))
-    return moved, at, force
-
-
-def _solved(
-    organ: trimesh.Trimesh,
-    bed: trimesh.Trimesh,
-    support: trimesh.Trimesh,
-    beads: np.ndarray,
-    near_mm: float,
-    indentations_mm: np.ndarray,
-) -> tuple[np.ndarray, ...]:
     press = FemPress(indentations_mm=tuple(indentations_mm.tolist()))
     experiment = FemExperiment(_mesh(organ, bed, press, near_mm), support, FemMaterial(), press)
     stages = list(experiment.stages())

@@ -12,13 +12,14 @@ import numpy as np
 import trimesh
 
 from rehearsal.configuration import PRESETS, Setup
-from rehearsal.resection.cut import Cut, CutSettings, cut_organ, faces_of
-from scenes.anatomy import LoadedAnatomy, load_anatomy
+from rehearsal.resection.cut import CutSettings, cut_organ, faces_of
+from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, PAPER, load_scene
 from scenes.surfaces import translated
 from sim.neo_hookean import NeoHookean
 from sim.removed_tissue import RemovedTissue
 from sim.solver import StepSettings
+from sim.stored_arrays import stored
 from studies.accuracy.bead_case import BeadCase, load_case
 from studies.accuracy.bead_errors import bead_errors, null_errors
 from studies.accuracy.bead_experiment import BeadExperiment
@@ -112,7 +113,9 @@ def balance_rows() -> tuple[list[BalanceRow], np.ndarray]:
     Taichi must be started. Raises MeshError, NotConvergedError.
     """
     setup = PRESETS["neo-hookean"]["balanced"]
-    uncut = _first_stages(load_case(UNCUT))
+    whole = load_case(UNCUT)
+    arrays = ("measured", "poses", "indentation_mm", "probe_force_n")
+    uncut = replace(whole, **{name: getattr(whole, name)[:STAGES] for name in arrays})
     cut, to_coarser = cut_case(uncut)
     experiments = {
         "whole": BeadExperiment(uncut, setup),
@@ -126,30 +129,30 @@ def balance_rows() -> tuple[list[BalanceRow], np.ndarray]:
     return rows, to_coarser
 
 
-def _first_stages(case: BeadCase) -> BeadCase:
-    arrays = ("measured", "poses", "indentation_mm", "probe_force_n")
-    return replace(case, **{name: getattr(case, name)[:STAGES] for name in arrays})
-
-
 def cut_case(uncut: BeadCase) -> tuple[CutCase, np.ndarray]:
-    """The case of the remnant, pressed as the uncut one is, and the distances (stages, n) [mm] of its beads
-    from those of the coarser mesh.
+    """The case of the remnant of the embedded patient's kidney, pressed as the uncut one is, and the distances
+    (stages, n) [mm] of its beads from those of the coarser mesh.
 
     Raises MeshError, NotConvergedError, ResectionError.
     """
     from studies.reference.make_reference import blue_noise, in_case_frame, pressed_beads
 
-    anatomy, gravity = embedded_anatomy(), np.array(load_scene(PAPER).gravity.direction)
-    cut = embedded_cut(anatomy)
+    anatomy, gravity = (
+        load_anatomy(load_scene(EMBEDDED), EMBEDDED.parent),
+        load_scene(PAPER).gravity.direction,
+    )
+    assert anatomy.tumour is not None
+    line = line_over(anatomy.organ, anatomy.tumour, SETTINGS.margin_mm)
+    cut = cut_organ(anatomy.organ, line, SETTINGS, np.asarray(anatomy.tumour.vertices))
     support_lps = load_anatomy(load_scene(PAPER), PAPER.parent).shapes[0]
     assert isinstance(support_lps, trimesh.Trimesh)
     organ, specimen, remnant, support = (
-        in_case_frame(surface, gravity, anatomy.organ)
+        in_case_frame(surface, np.array(gravity), anatomy.organ)
         for surface in (anatomy.organ, cut.specimen, cut.remnant, support_lps)
     )
     beads, bed = blue_noise(remnant), faces_of(remnant, cut.on_remnant)
     (coarse, *_), (measured, at, force) = (
-        pressed_beads(remnant, bed, support, beads, edge_mm, uncut.indentation_mm)
+        stored(pressed_beads, remnant, bed, support, beads, edge_mm, uncut.indentation_mm)
         for edge_mm in (COARSER_MM, EDGE_MM)
     )
     poses = uncut.poses.copy()
@@ -159,15 +162,3 @@ def cut_case(uncut: BeadCase) -> tuple[CutCase, np.ndarray]:
     )
     tissue = RemovedTissue(specimen, remnant, cut.on_remnant)
     return CutCase(case, tissue), np.linalg.norm(measured - coarse, axis=2)
-
-
-def embedded_anatomy() -> LoadedAnatomy:
-    """The embedded patient, whose kidney is that of the uncut case."""
-    return load_anatomy(load_scene(EMBEDDED), EMBEDDED.parent)
-
-
-def embedded_cut(anatomy: LoadedAnatomy) -> Cut:
-    """The cut of the embedded patient: enucleoresection with a margin of 3 mm."""
-    assert anatomy.tumour is not None
-    line = line_over(anatomy.organ, anatomy.tumour, SETTINGS.margin_mm)
-    return cut_organ(anatomy.organ, line, SETTINGS, np.asarray(anatomy.tumour.vertices))

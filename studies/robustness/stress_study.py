@@ -3,9 +3,8 @@
 An extreme is applied to a body and released, and what remains of the deformation is measured.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -33,9 +32,6 @@ from studies.study import Results, Study, quick_option, study_command
 from studies.tables_and_panels import draw_panel, panels_of, table_of
 from ultrasound.probe_manipulator import advanced
 
-# Cases of one body in a task, after which the progress bar advances; the process keeps the body for the next
-# task.
-BATCH = 4
 # How a case may end, and its colour; good ends first.
 OUTCOMES = {
     "recovered its position": "#2a7f4f",
@@ -68,28 +64,15 @@ def stability(study: Study, quick: bool) -> Results:
 
     Each model, under extremes of settings, tool and state.
     """
-    cases = {model: quick_cases_of(model) if quick else cases_of(model) for model in MODELS}
-    rows: list[dict[str, Any]] = []
-    with study.workers() as workers, study.progress(sum(map(len, cases.values())), "case") as bar:
-        for batch in workers.map(_run_all, _batches(cases)):
-            rows += batch
-            bar.update(len(batch))
+    tasks = [(model, case) for model in MODELS for case in (quick_cases_of if quick else cases_of)(model)]
+    with study.workers() as workers:
+        rows = list(study.progress(len(tasks), "case", workers.map(_run_in_worker, tasks)))
     return Results(dict(cases=rows), f"{table(rows)}\n\n{summary(rows)}", rows, figure_of(rows))
 
 
-def _batches(cases: dict[str, list[StressCase]]) -> Iterator[tuple[str, list[StressCase]]]:
-    """Cases of one model and body, in their order."""
-    for model, of_model in cases.items():
-        for _, group in groupby(of_model, key=lambda case: case.subject):
-            same = list(group)
-            yield from ((model, same[first : first + BATCH]) for first in range(0, len(same), BATCH))
-
-
-def _run_all(model: str, cases: list[StressCase]) -> list[dict[str, Any]]:
-    """The figures of cases with the same subject."""
-    subject = cases[0].subject
-    specimen = built_once((model, subject), lambda: prepared(model, subject))
-    return [run(specimen, model, case) for case in cases]
+def _run_in_worker(model: str, case: StressCase) -> dict[str, Any]:
+    """The figures of a case; the process keeps the body for the next one, which mostly has the same."""
+    return run(built_once((model, case.subject), lambda: prepared(model, case.subject)), model, case)
 
 
 class Extremes:

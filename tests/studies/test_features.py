@@ -3,12 +3,11 @@ as it began.
 """
 
 import functools
-import json
 
 import pytest
 import taichi as ti
-from PIL import Image
 from small_bead_case import briefly, small_anatomy
+from study_runs import written
 
 import app
 from rehearsal.configuration import PRESETS, setup_of
@@ -119,16 +118,11 @@ def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys)
         {"friction on shapes": feature_costs.EVERYWHERE["friction on shapes"]},
     )
     assert app.main(["study", "features", "--quick", "--out", str(tmp_path)]) == 0
-    rows = json.loads((tmp_path / "features.json").read_text())["features"]
-    assert [row["feature"] for row in rows] == [
-        "friction on shapes",
-        "divergence check",
-        "organ's surface",
-    ]
-    for row in rows:
+    report, rows = written(tmp_path, "features")
+    names = ["friction on shapes", "divergence check", "organ's surface"]
+    assert [row["feature"] for row in report["features"]] == [row["feature"] for row in rows] == names
+    for row in report["features"]:
         assert row["mb_on"] > row["mb_off"] and row["ms_on"] > 0
-    assert (tmp_path / "features.csv").is_file()
-    assert Image.open(tmp_path / "features.png").size[0] > 1000
     assert "what is off" not in capsys.readouterr().out
 
 

@@ -14,6 +14,7 @@ from ellipsoid_kidney import HALF_AXES, in_ellipsoid
 from PIL import Image
 from scipy import ndimage
 from scipy.stats import norm
+from study_runs import refusal
 
 import app
 from scenes.anatomy import Grid, LoadedAnatomy
@@ -436,16 +437,14 @@ class TestMadePatient:
     def test_a_patient_without_ct_is_refused_in_words(self, tmp_path, capsys):
         trimesh.creation.icosphere(radius=20.0).export(tmp_path / "organ.stl")
         (tmp_path / "scene.toml").write_text('[anatomy]\norgan = "organ.stl"\n')
-        arguments = ["study", "patient-images", str(tmp_path), "--out", str(tmp_path / "out")]
-        assert app.main(arguments) != 0
-        assert "has no CT or no labels" in capsys.readouterr().err
+        line = refusal(capsys, "study", "patient-images", tmp_path, "--out", tmp_path / "out")
+        assert "has no CT or no labels" in line
 
     def test_a_wrong_patient_is_refused_before_any_work(self, tmp_path, capsys):
         out = tmp_path / "out"
         write_patient(made_patient(), tmp_path)
-        arguments = ["study", "patient-images", str(tmp_path), str(tmp_path / "nobody"), "--out", str(out)]
-        assert app.main(arguments) != 0
-        assert "nobody: no such scene" in capsys.readouterr().err and not out.exists()
+        line = refusal(capsys, "study", "patient-images", tmp_path, tmp_path / "nobody", "--out", out)
+        assert "nobody: no such scene" in line and not out.exists()
 
 
 def test_every_tissue_has_a_colour():
