@@ -130,24 +130,21 @@ def balance_rows() -> tuple[list[BalanceRow], np.ndarray]:
 
 
 def cut_case(uncut: BeadCase) -> tuple[CutCase, np.ndarray]:
-    """The case of the remnant of the embedded patient's kidney, pressed as the uncut one is, and the distances
+    """The case of the embedded patient's remnant, pressed as the uncut kidney is, and the distances
     (stages, n) [mm] of its beads from those of the coarser mesh.
 
     Raises MeshError, NotConvergedError, ResectionError.
     """
     from studies.reference.make_reference import blue_noise, in_case_frame, pressed_beads
 
-    anatomy, gravity = (
-        load_anatomy(load_scene(EMBEDDED), EMBEDDED.parent),
-        load_scene(PAPER).gravity.direction,
-    )
+    anatomy, paper = load_anatomy(load_scene(EMBEDDED), EMBEDDED.parent), load_scene(PAPER)
     assert anatomy.tumour is not None
     line = line_over(anatomy.organ, anatomy.tumour, SETTINGS.margin_mm)
     cut = cut_organ(anatomy.organ, line, SETTINGS, np.asarray(anatomy.tumour.vertices))
-    support_lps = load_anatomy(load_scene(PAPER), PAPER.parent).shapes[0]
+    support_lps = load_anatomy(paper, PAPER.parent).shapes[0]
     assert isinstance(support_lps, trimesh.Trimesh)
     organ, specimen, remnant, support = (
-        in_case_frame(surface, np.array(gravity), anatomy.organ)
+        in_case_frame(surface, np.array(paper.gravity.direction), anatomy.organ)
         for surface in (anatomy.organ, cut.specimen, cut.remnant, support_lps)
     )
     beads, bed = blue_noise(remnant), faces_of(remnant, cut.on_remnant)
