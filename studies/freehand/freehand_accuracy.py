@@ -4,7 +4,7 @@ At rest, with a tracker's errors, and under compression.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -105,34 +105,37 @@ def _with_ct(path: Path) -> tuple[Scene, LoadedAnatomy]:
 
 
 def measure(
-    scene: Scene,
-    anatomy: LoadedAnatomy,
-    setup: Setup,
-    arch: str,
-    quick: bool,
-    done: Callable[[], Any],
+    scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str, quick: bool, done: Callable[[], Any]
 ) -> dict[str, Any]:
     """All figures of one patient; starts Taichi anew."""
     start(arch)
-    probe = load_probe(PROBE)
-    truth = resting(anatomy, probe, np.array(scene.gravity.direction), PIXELS, scene.image.atlas)
+    truth = resting(anatomy, load_probe(PROBE), np.array(scene.gravity.direction), PIXELS, scene.image.atlas)
     surfaces = surfaces_of(anatomy)
-    rest = []
-    for method in METHODS:
-        rest.append(dict(method=method) | _row(truth, truth.poses, surfaces, method=method))
-        done()
-    curves = noise_curves(truth, surfaces, quick, done)
-    pressed_rows = [] if anatomy.tumour is None else compression(scene, anatomy, setup, arch, quick, done)
+    parts = dict(
+        resting=at_rest(truth, surfaces),
+        noise=noise_curves(truth, surfaces, quick),
+        compression=[] if anatomy.tumour is None else compression(scene, anatomy, setup, arch, quick),
+    )
+    rows: dict[str, list[dict[str, Any]]] = {kind: [] for kind in parts}
+    for kind, of_kind in parts.items():
+        for of_volume in of_kind:
+            rows[kind] += of_volume
+            done()
+    apart_mm = np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1).mean()
     return dict(
         probe=PROBE,
         spacing_mm=SPACING_MM,
         reach_mm=REACH_MM,
         frames=len(truth.poses),
-        apart_mm=round(float(np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1).mean()), 4),
-        resting=rest,
-        noise=curves,
-        compression=pressed_rows,
+        apart_mm=round(float(apart_mm), 4),
+        **rows,
     )
+
+
+def at_rest(truth: GroundTruthSweep, surfaces: dict[str, trimesh.Trimesh]) -> Iterator[list[dict[str, Any]]]:
+    """Figures of the resting sweep by each method."""
+    for method in METHODS:
+        yield [dict(method=method) | _row(truth, truth.poses, surfaces, method=method)]
 
 
 def count_of(anatomy: LoadedAnatomy, quick: bool) -> int:
@@ -150,29 +153,22 @@ def _depths(quick: bool) -> tuple[float, ...]:
 
 
 def noise_curves(
-    truth: GroundTruthSweep, surfaces: dict[str, trimesh.Trimesh], quick: bool, done: Callable[[], Any]
-) -> list[dict[str, Any]]:
+    truth: GroundTruthSweep, surfaces: dict[str, trimesh.Trimesh], quick: bool
+) -> Iterator[list[dict[str, Any]]]:
     """Figures of the resting sweep for trackers with one error each."""
-    times = truth.sweep.times_s[::EVERY]
+    poses, times = truth.poses[::EVERY], truth.sweep.times_s[::EVERY]
     few = replace(
-        truth,
-        sweep=sweep_of(truth.sweep.images[::EVERY], truth.poses[::EVERY], times, truth.on_probe),
-        poses=truth.poses[::EVERY],
+        truth, sweep=sweep_of(truth.sweep.images[::EVERY], poses, times, truth.on_probe), poses=poses
     )
-    trials = [TrackingErrors()] + [
-        TrackingErrors(**{name: size}) for name, sizes in VARIED.items() for size in _sizes(sizes, quick)
-    ]
-    rows = []
-    for errors in trials:
-        poses = with_tracking_errors(few.poses, few.sweep.times_s, errors, SEED)
-        rows.append(asdict(errors) | _row(few, poses, surfaces))
-        done()
-    return rows
+    sizes = [(name, size) for name, values in VARIED.items() for size in _sizes(values, quick)]
+    for errors in [TrackingErrors(), *(TrackingErrors(**{name: size}) for name, size in sizes)]:
+        tracked = with_tracking_errors(poses, times, errors, SEED)
+        yield [asdict(errors) | _row(few, tracked, surfaces)]
 
 
 def compression(
-    scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str, quick: bool, done: Callable[[], Any]
-) -> list[dict[str, Any]]:
+    scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str, quick: bool
+) -> Iterator[list[dict[str, Any]]]:
     """Figures of sweeps pressed over the tumour at some depths, without and with compression correction."""
     start(arch)
     small = with_options(scene_of(scene, setup), {"image.pixels": PIXELS})
@@ -180,17 +176,16 @@ def compression(
     fixed = scene.attachment.model_copy(update={"radius_mm": radius_mm, "stiffness_n_mm": 0.0})
     rehearsal = rehearsal_of(small.model_copy(update={"attachment": fixed}), anatomy)
     surfaces = surfaces_of(anatomy)
-    rows = []
     for depth in _depths(quick):
         truth = pressed(rehearsal, depth)
         rehearsal.reset()
         track = image_poses_of(truth.sweep, REFERENCE)
         correction = CompressionCorrection(rehearsal, truth.sweep, track, REFERENCE)
-        for undone, places in ((False, None), (True, correction)):
-            row = dict(depth_mm=depth, compression_mm=round(truth.compression_mm, 4), undone=undone)
-            rows.append(row | _row(truth, truth.poses, surfaces, places))
-        done()
-    return rows
+        press = dict(depth_mm=depth, compression_mm=round(truth.compression_mm, 4))
+        yield [
+            press | dict(undone=undone) | _row(truth, truth.poses, surfaces, places)
+            for undone, places in ((False, None), (True, correction))
+        ]
 
 
 def _row(

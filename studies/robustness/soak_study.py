@@ -89,21 +89,18 @@ def run_soak(
     rehearsal = build(scene, anatomy, setup, arch)
     organ = rehearsal.organ
     first, begun = organ.snapshot(), organ.digest()
-
-    def drive(numbers: range) -> list[dict[str, Any]]:
-        rows = []
-        for number in numbers:
-            rows.append(_minute(rehearsal, number, minute_s, first))
-            done()
-        return rows
-
     replayed = range(max(minutes - REPLAYED_MINUTES, 0), minutes)
-    rows = drive(range(replayed.start))
-    snapshot = organ.snapshot()
-    rows += drive(replayed)
+    rows = []
+    for number in range(minutes):
+        if number == replayed.start:
+            before = organ.snapshot()
+        rows.append(_minute(rehearsal, number, minute_s, first))
+        done()
     ended = organ.digest()
-    organ.restore(snapshot)
-    drive(replayed)
+    organ.restore(before)
+    for number in replayed:
+        _minute(rehearsal, number, minute_s, first)
+        done()
     again = organ.digest()
     organ.restore(first)
     return dict(

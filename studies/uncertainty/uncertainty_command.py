@@ -92,16 +92,16 @@ def _problem(unknowns: Sequence[Unknown]) -> dict[str, Any]:
 
 
 QUALITY = "fast"
-COLUMNS = {
-    "quantity": "{name}",
-    "5 %": "{low:.2f}",
-    "median": "{median:.2f}",
-    "95 %": "{high:.2f}",
-    "depends most on": "{first}",
-    "index": "{first_index:.2f}",
-    "next": "{second}",
-    " index": "{second_index:.2f}",
-}
+COLUMNS = (
+    ("quantity", "{name}"),
+    ("5 %", "{low:.2f}"),
+    ("median", "{median:.2f}"),
+    ("95 %", "{high:.2f}"),
+    ("depends most on", "{first}"),
+    ("index", "{first_index:.2f}"),
+    ("next", "{second}"),
+    ("index", "{second_index:.2f}"),
+)
 WORDS = {
     "tumour_shift_mm": "tumour shift, mm",
     "to_tumour_mm": "face to tumour, mm",
