@@ -1,4 +1,6 @@
-"""What the studies share: a rehearsal built with a setup, and what is measured of it."""
+"""What the studies share: a rehearsal built with a setup, blocks without a scene, and what is measured of
+them.
+"""
 
 import math
 from dataclasses import replace
@@ -6,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import psutil
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from rehearsal.case import case_of
@@ -13,9 +16,17 @@ from rehearsal.configuration import Setup, scene_of
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
+from sim.body import Body, ParticleBody
 from sim.device import start
 from sim.fields import Field, array_of
+from sim.lattice import fill_block, surface_points
+from sim.neo_hookean import NeoHookean
+from sim.particle_contact import ShapeContacts
+from sim.sampling import RestBody, group_into_patches
+from sim.shape_matching import ShapeMatching
+from sim.shapes import ConvexTool
 from sim.solver import Solver
+from sim.surface_contact import SurfaceContacts
 from ultrasound.probe import Probe
 
 
@@ -28,6 +39,12 @@ def build(scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str) -> Rehe
     """A scene's rehearsal at rest with a setup, on a freshly started device; without images."""
     start(arch)
     return rehearsal_of(scene_of(scene, setup), without_images(anatomy))
+
+
+def step_of(setup: Setup) -> dict[str, Any]:
+    """The settings of a step, under the names of a report."""
+    names = dict(substeps=setup.substeps, iterations=setup.iterations)
+    return names | dict(time_step_s=setup.solver.time_step_s)
 
 
 def without_images(anatomy: LoadedAnatomy) -> LoadedAnatomy:
@@ -78,3 +95,27 @@ def distances_after_fit(points: np.ndarray, reference: np.ndarray) -> np.ndarray
     if len(reference) > 1:
         points = Rotation.align_vectors(reference, points)[0].apply(points)
     return np.linalg.norm(points - reference, axis=1)
+
+
+# The paper's friction, and width of a cluster in radii.
+FRICTION, CLUSTER_SPACING = 0.35, 3.33
+
+
+def block_of_cells(side: int, cell_mm: float, shapes: list, tool: ConvexTool | None = None) -> Solver:
+    """A cube from the origin on, ``side`` cells along each edge, in contact with shapes, perhaps a tool."""
+    lattice = fill_block((side, side, side), cell_mm)
+    body = Body(lattice.nodes)
+    cube = trimesh.creation.box(bounds=[[0.0] * 3, [side * cell_mm] * 3])
+    contacts = SurfaceContacts(body, lattice, *surface_points(cube, cell_mm / 2), shapes, FRICTION)
+    return Solver(NeoHookean(body, lattice, contacts), tool=tool)
+
+
+def block_of_particles(
+    points_mm: np.ndarray, radius_mm: float, shapes: list, tool: ConvexTool | None = None
+) -> Solver:
+    """Particles at points (n, 3) [mm], a radius apart, in contact with shapes, of which one may be a tool."""
+    rest = RestBody(points_mm, radius_mm, np.full(len(points_mm), radius_mm / 2))
+    arranged, patches = group_into_patches(rest, CLUSTER_SPACING)
+    body = ParticleBody(arranged)
+    contacts = ShapeContacts(body, shapes, FRICTION)
+    return Solver(ShapeMatching(body, patches, contacts), tool=tool)

@@ -32,7 +32,7 @@ STUDIES = {
         "studies.cohort.cohort_command:cohort",
         "Settle, press and plan for each patient, in one table.",
     ),
-    "import": ("studies.performance.import_timing_command:intake", "Measure an import: seconds and memory."),
+    "import": ("studies.performance.import_timing:intake", "Measure an import: seconds and memory."),
     "freehand": (
         "studies.freehand.freehand_accuracy:freehand",
         "Compare volumes of tracked sweeps with the ground truth.",

@@ -60,23 +60,23 @@ class ValidateOptions(ArchOptions):
 
 
 @command(ValidateOptions)
-def validate(asked: ValidateOptions) -> None:
+def validate(options: ValidateOptions) -> None:
     """Compare with the bead experiment of CASE, a folder.
 
     The organ is pressed as in the experiment, and its beads compared with the measured ones.
     """
-    changes = asked.model_dump(
+    changes = options.model_dump(
         exclude={"case", "model", "quality", "check", "arch", "json_file"}, exclude_none=True
     )
-    setup = choose_setup(asked.model or model_with(changes, USUAL), asked.quality, **changes)
-    loaded = load_case(asked.case)
-    make_place(asked.json_file)
-    used = start_taichi(asked.arch)
+    setup = choose_setup(options.model or model_with(changes, USUAL), options.quality, **changes)
+    loaded = load_case(options.case)
+    make_place(options.json_file)
+    used = start_taichi(options.arch)
     from studies.accuracy import convergence_study
     from studies.accuracy.bead_errors import force_table, report, summary, table
     from studies.accuracy.bead_experiment import BeadExperiment
 
-    if asked.check:
+    if options.check:
         convergence_study.changes_of(setup)
     started = perf_counter()
     experiment = BeadExperiment(loaded, setup)
@@ -88,15 +88,15 @@ def validate(asked: ValidateOptions) -> None:
     if np.isfinite(run.force_n).all():
         click.echo(f"\n{force_table(loaded, run.force_n)}")
     try:
-        if asked.check:
+        if options.check:
             figures["independence"] = []
             click.echo(f"\n{convergence_study.HEAD}")
             for row in convergence_study.moved(experiment, setup, run.beads):
                 click.echo(convergence_study.line(row))
                 figures["independence"].append(row)
     finally:
-        if asked.json_file is not None:
-            save_figures(figures, asked.json_file)
+        if options.json_file is not None:
+            save_figures(figures, options.json_file)
 
 
 class CalibrateOptions(CommandOptions):
@@ -130,7 +130,7 @@ class CalibrateOptions(CommandOptions):
 
 
 @command(CalibrateOptions)
-def calibrate(asked: CalibrateOptions) -> None:
+def calibrate(options: CalibrateOptions) -> None:
     """Fit a tissue model to bead experiments.
 
     The experiments are the folders CASE.
@@ -138,58 +138,47 @@ def calibrate(asked: CalibrateOptions) -> None:
     data. neo-hookean: moduli, Poisson's ratio and friction by least squares, from beads and, where the case
     has them, forces on the probe.
     """
-    asked = asked.model_copy(update={"case": without_system_files(asked.case) or asked.case})
-    if asked.model == USUAL:
-        _fit_material(asked)
+    options = options.model_copy(update={"case": without_system_files(options.case) or options.case})
+    if options.model == USUAL:
+        _fit_material(options)
     else:
-        _fit_shape_matching(asked)
+        _fit_shape_matching(options)
 
 
-def _fit_material(asked: CalibrateOptions) -> None:
-    loaded = [load_case(case) for case in asked.case]
-    make_folder(asked.out)
+def _fit_material(options: CalibrateOptions) -> None:
+    loaded = [load_case(case) for case in options.case]
+    make_folder(options.out)
     from studies.accuracy import material_fit
 
-    setup = choose_setup(asked.model, asked.quality)
-    with Workers(asked.jobs, asked.dask) as workers, tqdm(desc="calibrate", unit="press") as bar:
+    setup = choose_setup(options.model, options.quality)
+    with Workers(options.jobs, options.dask) as workers, tqdm(desc="calibrate", unit="press") as bar:
         fit = material_fit.fitted(loaded, setup, workers, bar.update)
     figures = fit.report()
-    save_figures(figures, asked.out / "material.json")
+    save_figures(figures, options.out / "material.json")
     click.echo(f"\n{material_fit.table(figures)}")
 
 
-def _fit_shape_matching(asked: CalibrateOptions) -> None:
-    out, generations, spacing = asked.out, asked.search, asked.grid
-    radii_mm = numbers(asked.radii, "--radii", 0.5, 20)
-    loaded = [load_case(case) for case in asked.case]
+def _fit_shape_matching(options: CalibrateOptions) -> None:
+    out, generations, spacing = options.out, options.search, options.grid
+    radii_mm = numbers(options.radii, "--radii", 0.5, 20)
+    loaded = [load_case(case) for case in options.case]
     make_folder(out)
     from studies.accuracy import calibration, calibration_results, case_workers
 
-    split = calibration.split_of(loaded, asked.hold_out)
-    with Workers(asked.jobs, asked.dask) as workers:
-        evaluate = partial(workers.map, case_workers.evaluate)
-        if generations:
-            count = calibration.search_count(len(loaded), len(radii_mm), generations)
-        else:
-            count = calibration.exhaustive_count(len(loaded), len(radii_mm), spacing)
-        with tqdm(total=count, desc="calibrate", unit="press") as bar:
-            found = calibration.Calibration(loaded, split, evaluate, bar.update)
-            if generations:
-                found.search(radii_mm, generations)
-            else:
-                found.exhaustive(radii_mm, spacing)
-            bar.total = bar.n
-    tables = calibration_results.tables_of(found)
-    for table in tables:
-        table.write_csv(out)
-        table.write_png(out)
-        click.echo(f"\n{table.text()}")
-    calibration_results.write_calibration(found, tables, out / "calibration.json")
-    calibration_results.write_figure5(found, out / "figure5.png")
+    split, sizes = calibration.split_of(loaded, options.hold_out), (len(loaded), len(radii_mm))
     if generations:
-        calibration_results.write_search(found, out / "search.png")
+        count = calibration.search_count(*sizes, generations)
     else:
-        calibration_results.write_figure4(found, out / "figure4.png")
-    click.echo(
-        f"\n{calibration_results.summary_of(found)}\nWrote tables, figures and calibration.json to {out}"
-    )
+        count = calibration.exhaustive_count(*sizes, spacing)
+    with (
+        Workers(options.jobs, options.dask) as workers,
+        tqdm(total=count, desc="calibrate", unit="press") as bar,
+    ):
+        evaluate = partial(workers.map, case_workers.evaluate)
+        fit = calibration.Calibration(loaded, split, evaluate, bar.update)
+        if generations:
+            fit.search(radii_mm, generations)
+        else:
+            fit.exhaustive(radii_mm, spacing)
+        bar.total = bar.n
+    calibration_results.write(fit, out, searched=bool(generations))

@@ -108,9 +108,7 @@ class Files(CaseSection):
 
 
 class CaseProbe(CaseSection):
-    """A cuboid, full lengths along its own axes, edges rounded inside them; columns of ``rotation`` are
-    these axes.
-    """
+    """A cuboid: full lengths along its axes, the columns of ``rotation``; its edges are rounded inside."""
 
     shape: Literal["cuboid"]
     size_mm: tuple[Length, ...] = Field(min_length=3, max_length=3, strict=False)
@@ -184,8 +182,7 @@ class CaseFile(CaseSection):
             if abs(along - stage.indentation_mm) > MOST_APART_MM:
                 raise ValueError(
                     f"stage {place} has indentation_mm {stage.indentation_mm:g}, but its position is "
-                    f"{along:.2f} mm "
-                    f"from stage 0's along press_direction: correct one of them"
+                    f"{along:.2f} mm from stage 0's along press_direction: correct one of them"
                 )
         return self
 
@@ -286,9 +283,7 @@ def _surface(folder: Path, name: str) -> trimesh.Trimesh:
 
 
 def _read_beads(path: Path, stages: int) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Positions of the beads (n, 3) stress-free and (stages, n, 3) measured [mm], and their lines in the
-    file (n,).
-    """
+    """Beads (n, 3) stress-free and (stages, n, 3) measured [mm], and their lines in the file (n,)."""
     columns = [f"{axis}{stage}" for stage in ("", *range(stages)) for axis in "xyz"]
     values, lines = read_numbers(path, columns, CaseError)
     positions = values.reshape(len(values), stages + 1, 3).transpose(1, 0, 2)
@@ -302,16 +297,14 @@ def _check_beads(
     if outside.max() > 0:
         raise CaseError(
             f"{path}: the bead on line {lines[outside.argmax()]} is {outside.max():.2f} mm outside the organ "
-            "at x, y, z: "
-            f"expected a place inside, in mm in the organ's frame"
+            "at x, y, z: expected a place inside, in mm in the organ's frame"
         )
     moved = np.linalg.norm(measured - beads, axis=2)
     stage, bead = np.unravel_index(moved.argmax(), moved.shape)
     if moved.max() > organ.extents.max():
         raise CaseError(
             f"{path}: the bead on line {lines[bead]} is {moved.max():.0f} mm from its stress-free place at "
-            f"stage {stage}: "
-            f"expected less than the organ's length, in mm in the organ's frame"
+            f"stage {stage}: expected less than the organ's length, in mm in the organ's frame"
         )
 
 

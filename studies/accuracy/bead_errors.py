@@ -8,16 +8,31 @@ from rehearsal.configuration import Setup
 from rehearsal.result_files import counted, rounded, spread
 from studies.accuracy.bead_case import BeadCase
 from studies.accuracy.bead_experiment import BeadExperiment, BeadRun
+from studies.harness import step_of
 from studies.reference.smooth_obstacles import RoundedBox
-from studies.study_results import text_table
+from studies.tables_and_panels import table_of
 
 DISTANCE_BANDS = 4
 # Shares of smaller forces say nothing.
 LEAST_FORCE_N = 0.05
-HEADERS = ("stage", "indentation, mm", "mean", "% of travel", "SD", "max", "unmoved", "ratio", "r(distance)")
-FORMATS = ("", ".2f", ".2f", ".0f", *[".2f"] * 5)
-FORCE_HEADERS = ("stage", "force on the probe x, y, z, N", "measured", "difference, N", "%")
-FORCE_FORMATS = ("", "", "", ".3f", ".1f")
+COLUMNS = {
+    "stage": "{stage}",
+    "indentation, mm": "{indentation_mm:.2f}",
+    "mean": "{mean_mm:.2f}",
+    "% of travel": "{percent_of_travel:.0f}",
+    "SD": "{sd_mm:.2f}",
+    "max": "{max_mm:.2f}",
+    "unmoved": "{null_mean_mm:.2f}",
+    "ratio": "{ratio:.2f}",
+    "r(distance)": "{related:.2f}",
+}
+FORCE_COLUMNS = {
+    "stage": "{stage}",
+    "force on the probe x, y, z, N": "{simulated}",
+    "measured": "{measured}",
+    "difference, N": "{apart:.3f}",
+    "%": "{percent:.1f}",
+}
 
 
 def bead_errors(case: BeadCase, beads: np.ndarray) -> np.ndarray:
@@ -26,16 +41,12 @@ def bead_errors(case: BeadCase, beads: np.ndarray) -> np.ndarray:
 
 
 def null_errors(case: BeadCase) -> np.ndarray:
-    """Errors (stages, n) [mm] of predicting no motion: beads that stay where they were measured at stage
-    0.
-    """
+    """Errors (stages, n) [mm] of predicting no motion: of beads that stay where they are at stage 0."""
     return np.linalg.norm(case.measured - case.measured[0], axis=2)
 
 
 def probe_distances(case: BeadCase) -> np.ndarray:
-    """Distances (stages, n) [mm] of the measured beads from the probe's surface at their stage; negative
-    inside it.
-    """
+    """Distances (stages, n) [mm] of the measured beads from the probe's surface, negative inside it."""
     box = RoundedBox(case.size_mm, case.edge_radius_mm)
     placed = zip(case.measured, case.poses, strict=True)
     return np.stack([box.gap((beads - pose[:3, 3]) @ pose[:3, :3]) for beads, pose in placed])
@@ -68,11 +79,11 @@ def force_figures(case: BeadCase, run: BeadRun) -> list[dict[str, Any]]:
     """
     return [
         dict(
-            probe_force_N=_vector(found),
+            probe_force_N=_vector(simulated),
             measured_probe_force_N=_vector(measured),
             part_centroids_mm=[_vector(part) for part in parts],
         )
-        for found, measured, parts in zip(run.force_n, case.probe_force_n, run.parts_mm, strict=True)
+        for simulated, measured, parts in zip(run.force_n, case.probe_force_n, run.parts_mm, strict=True)
     ]
 
 
@@ -88,18 +99,14 @@ def correlation(first: np.ndarray, second: np.ndarray) -> float | None:
 
 
 def report(experiment: BeadExperiment, setup: Setup, run: BeadRun) -> dict:
-    """The figures of ``validate --json``; the correlation is over all beads at all stages with
-    indentation.
-    """
+    """The figures of ``validate --json``; the correlation is over all beads at stages with indentation."""
     case = experiment.case
     errors = bead_errors(case, run.beads)
     return dict(
         case=case.name,
         model=setup.model,
         **experiment.size(setup),
-        substeps=setup.substeps,
-        iterations=setup.iterations,
-        time_step_s=setup.solver.time_step_s,
+        **step_of(setup),
         parts=[part.name for part in case.parts],
         stages=[
             figures | forces
@@ -137,31 +144,36 @@ def table(case: BeadCase, beads: np.ndarray) -> str:
     errors by distance.
     """
     errors, null, distances = bead_errors(case, beads), null_errors(case), probe_distances(case)
-    rows: list[list[Any]] = []
+    rows: list[dict[str, Any]] = []
     for stage, row in enumerate(stage_figures(case.indentation_mm, errors, null)):
         mean, unmoved = row["mean_mm"], row["null_mean_mm"]
         ratio = mean / unmoved if mean is not None and unmoved else None
-        share = row["percent_of_travel"]
         related = correlation(distances[stage], errors[stage])
-        depth = row["indentation_mm"]
-        rows.append([stage, depth, mean, share, row["sd_mm"], row["max_mm"], unmoved, ratio, related])
-    overall = errors.mean() / null.mean()
-    rows.append(["all", None, errors.mean(), None, None, errors.max(), null.mean(), overall, None])
+        rows.append(row | dict(stage=stage, ratio=ratio, related=related))
+    overall = dict.fromkeys(rows[0]) | dict(stage="all", mean_mm=errors.mean(), max_mm=errors.max())
+    rows.append(overall | dict(null_mean_mm=null.mean(), ratio=errors.mean() / null.mean()))
     related = correlation(distances[1:], errors[1:])
     shown = "-" if related is None else f"{related:.2f}"
     title = f"Error by distance from the probe, stages pressed; correlation {shown}:"
     bands = _bands(distances[1:].ravel(), errors[1:].ravel())
-    return "\n".join([text_table(HEADERS, rows, FORMATS), "", title, *bands])
+    return "\n".join([table_of(COLUMNS, rows), "", title, *bands])
 
 
 def force_table(case: BeadCase, force_n: np.ndarray) -> str:
     """The tissue's force on the probe (stages, 3) [N] beside the measured one."""
-    rows: list[list[Any]] = []
-    for stage, (found, measured) in enumerate(zip(force_n, case.probe_force_n, strict=True)):
-        apart, size = np.linalg.norm(found - measured), np.linalg.norm(measured)
-        share = 100 * apart / size if size > LEAST_FORCE_N else None
-        rows.append([stage, _in_words(found), _in_words(measured), None if np.isnan(apart) else apart, share])
-    return text_table(FORCE_HEADERS, rows, FORCE_FORMATS)
+    rows = []
+    for stage, (simulated, measured) in enumerate(zip(force_n, case.probe_force_n, strict=True)):
+        apart, size = np.linalg.norm(simulated - measured), np.linalg.norm(measured)
+        rows.append(
+            dict(
+                stage=stage,
+                simulated=_in_words(simulated),
+                measured=_in_words(measured),
+                apart=None if np.isnan(apart) else apart,
+                percent=100 * apart / size if size > LEAST_FORCE_N else None,
+            )
+        )
+    return table_of(FORCE_COLUMNS, rows)
 
 
 def _in_words(force_n: np.ndarray) -> str:
@@ -172,9 +184,8 @@ def _bands(distances: np.ndarray, errors: np.ndarray) -> list[str]:
     """Mean errors in bands of distance that hold equally many beads."""
     order = np.argsort(distances, kind="stable")
     return [
-        f"  {distances[band].min():5.1f} to {distances[band].max():5.1f} mm  {errors[band].mean():5.2f} "
-        "mm on average, "
-        f"{errors[band].max():5.2f} at most ({len(band)} bead positions)"
+        f"  {distances[band].min():5.1f} to {distances[band].max():5.1f} mm  {errors[band].mean():5.2f} mm "
+        f"on average, {errors[band].max():5.2f} at most ({len(band)} bead positions)"
         for band in np.array_split(order, DISTANCE_BANDS)
         if len(band)
     ]

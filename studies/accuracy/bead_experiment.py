@@ -113,13 +113,13 @@ class BeadExperiment:
 
     def _part_centroids(self) -> np.ndarray:
         """Present centroids (parts, 3) [mm] of the parts' volumes."""
-        found = np.zeros((len(self.parts), 3))
-        for centroid, (skin, faces) in zip(found, self.parts, strict=True):
+        centroids = np.zeros((len(self.parts), 3))
+        for centroid, (skin, faces) in zip(centroids, self.parts, strict=True):
             skin.update()
             corner = array_of(skin.vertices)[faces].astype(float)
             six_volumes = np.einsum("fi,fi->f", corner[:, 0], np.cross(corner[:, 1], corner[:, 2]))
             centroid[:] = six_volumes @ corner.sum(axis=1) / 4 / six_volumes.sum() + self.origin
-        return found
+        return centroids
 
     def relative(self, pose: np.ndarray) -> np.ndarray:
         """A pose (4, 4) of the case's frame, in that of the device."""
@@ -128,9 +128,7 @@ class BeadExperiment:
         return moved
 
     def size(self, setup: Setup) -> dict[str, float]:
-        """Size of the model, under the names of a report: ``radius_mm`` or ``cell_mm``, ``particles`` or
-        ``nodes``.
-        """
+        """Size of the model, under a report's names: ``radius_mm`` or ``cell_mm``, and its counts."""
         return {setup.tissue.size_key: setup.size_mm, **self.model.counts()}
 
     def describe(self, setup: Setup) -> str:

@@ -82,9 +82,7 @@ class Calibration:
         return self.split.held_out_mm([null_errors(case) for case in self.cases])
 
     def exhaustive(self, radii_mm: Sequence[float], spacing: float) -> None:
-        """The paper's search: every stiffness on a grid for each radius, then on a finer grid around the
-        best of each.
-        """
+        """The paper's search: for each radius each stiffness on a grid, then a finer one around the best."""
         grid = stiffness_grid(spacing)
         self._try_all([setup_of(MODEL, radius_mm=r, stiffness=a) for r in radii_mm for a in grid])
         finer = {r: finer_grid(self.best(r).setup.tissue.stiffness, spacing) for r in radii_mm}
@@ -120,9 +118,7 @@ class Calibration:
             )
 
     def _try_all(self, setups: Sequence[Setup]) -> list[CalibrationTrial]:
-        """Evaluate setups on every case; case by case, as a worker keeps what it has built for a case and
-        a radius.
-        """
+        """Evaluate setups case by case, as a worker keeps what it has built for a case and a radius."""
         results = []
         for result in self.workers([(case, setup) for case in self.cases for setup in setups]):
             results.append(result)
@@ -130,10 +126,9 @@ class Calibration:
         trials = []
         for place, setup in enumerate(setups):
             measured = tuple(results[place :: len(setups)])
-            errors = [each.errors for each in measured]
-            trial = CalibrationTrial(
-                setup, measured, self.split.fit_mm(errors), self.split.held_out_mm(errors)
-            )
+            errors = [result.errors for result in measured]
+            fit_mm, held_out_mm = self.split.fit_mm(errors), self.split.held_out_mm(errors)
+            trial = CalibrationTrial(setup, measured, fit_mm, held_out_mm)
             trials.append(trial)
             self.trials.setdefault(setup.tissue.radius_mm, []).append(trial)
         return trials

@@ -8,27 +8,34 @@ from functools import partial
 from itertools import accumulate
 from pathlib import Path
 
+import click
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
+from tabulate import tabulate
 
 from rehearsal.result_files import rounded, save_figure, spread, write_csv, write_json
 from studies.accuracy.calibration import MOST_ERROR, Calibration, CalibrationTrial, quartic
-from studies.study_results import DPI, finish_axes, text_table
+from studies.study import DPI
+from studies.tables_and_panels import Curve, draw_panel, panels_of, table_of
 
 FIT, HELD_OUT = "fit", "held out"
-SUMMARY_HEADERS = ("radius, mm", "stiffness", "relaxation", "iterations", "fit, mm", "held out, mm")
+SUMMARY = {
+    "radius, mm": "{radius_mm:g}",
+    "stiffness": "{stiffness:.3f}",
+    "relaxation": "{relaxation_factor:.2f}",
+    "iterations": "{iterations:g}",
+    "fit, mm": "{fit_mm:.2f}",
+    "held out, mm": "{held_out_mm:.2f}",
+}
 _save = partial(save_figure, dpi=DPI, bbox_inches="tight")
 Row = list[float | None]
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of names and one figure a radius; ``shares``, where given, are the figures as % of the probe's
-    travel.
-    """
+    """Rows of names and one figure a radius; ``shares``, if any, are those in % of the probe's travel."""
 
     name: str
     title: str
@@ -38,37 +45,37 @@ class Table:
     figures: list[Row]
     shares: list[Row] = field(default_factory=list)
 
+    def columns(self) -> list[str]:
+        """The head, and each radius."""
+        return self.head + [f"{radius:g} mm" for radius in self.radii_mm]
+
     def cells(self) -> list[list[str]]:
-        """All lines as text, the head first."""
-        lines = [self.head + [f"{radius:g} mm" for radius in self.radii_mm]]
-        for row, (names, figures) in enumerate(zip(self.names, self.figures, strict=True)):
-            shares = self.shares[row] if self.shares else [None] * len(figures)
-            lines.append(names + [_cell(*pair) for pair in zip(figures, shares, strict=True)])
-        return lines
+        """All rows as text."""
+        shares = self.shares or [[None] * len(self.radii_mm)] * len(self.names)
+        lines = zip(self.names, self.figures, shares, strict=True)
+        return [names + [_cell(*pair) for pair in zip(*values, strict=True)] for names, *values in lines]
 
     def text(self) -> str:
         """Title and aligned columns."""
-        head, *rows = self.cells()
-        return f"{self.title}\n{text_table(head, rows)}"
+        return f"{self.title}\n{tabulate(self.cells(), self.columns(), tablefmt='plain')}"
 
     def write_csv(self, folder: Path) -> None:
         """``name``.csv: a column of numbers a radius, and of its shares."""
-        columns = self.head + [f"{radius:g} mm" for radius in self.radii_mm]
-        rows: list[list] = [names + figures for names, figures in zip(self.names, self.figures, strict=True)]
-        if self.shares:
-            columns += [f"{radius:g} mm, % of travel" for radius in self.radii_mm]
-            rows = [row + shares for row, shares in zip(rows, self.shares, strict=True)]
-        write_csv([dict(zip(columns, row, strict=True)) for row in rows], folder / f"{self.name}.csv")
+        shares = self.shares or [[]] * len(self.names)
+        columns = self.columns() + [f"{radius:g} mm, % of travel" for radius in self.radii_mm if self.shares]
+        parts = zip(self.names, self.figures, shares, strict=True)
+        lines = [[*names, *figures, *share] for names, figures, share in parts]
+        write_csv([dict(zip(columns, line, strict=True)) for line in lines], folder / f"{self.name}.csv")
 
     def write_png(self, folder: Path) -> None:
         """``name``.png: the table as an image."""
-        cells = self.cells()
-        wide = [max(len(line[column]) for line in cells) + 3 for column in range(len(cells[0]))]
-        figure = Figure(figsize=(0.085 * sum(wide) + 0.4, 0.26 * (len(cells) + 1.5)))
+        columns, cells = self.columns(), self.cells()
+        wide = [max(map(len, column)) + 3 for column in zip(columns, *cells, strict=True)]
+        figure = Figure(figsize=(0.085 * sum(wide) + 0.4, 0.26 * (len(cells) + 2.5)))
         axes = figure.subplots()
         axes.axis("off")
-        widths = [w / sum(wide) for w in wide]
-        drawn = axes.table(cells[1:], colLabels=cells[0], colWidths=widths, bbox=Bbox.unit())
+        widths = [width / sum(wide) for width in wide]
+        drawn = axes.table(cells, colLabels=columns, colWidths=widths, bbox=Bbox.unit())
         drawn.auto_set_font_size(False)
         drawn.set_fontsize(9)
         for (row, _), cell in drawn.get_celld().items():
@@ -89,7 +96,23 @@ def tables_of(calibration: Calibration) -> list[Table]:
         _bead_table(calibration, best, "table3", "Table 3: bead error, standard deviation (mm)", np.std),
         _bead_table(calibration, best, "table4", "Table 4: bead error, maximum (mm)", np.max),
     ]
-    return [means, *(replace(each, shares=[]) for each in others), _times(calibration, best)]
+    return [means, *(replace(table, shares=[]) for table in others), _times(calibration, best)]
+
+
+def write(calibration: Calibration, out: Path, searched: bool) -> None:
+    """Write tables, figures and calibration.json into a folder, and print the tables. Raises OSError."""
+    tables = tables_of(calibration)
+    for table in tables:
+        table.write_csv(out)
+        table.write_png(out)
+        click.echo(f"\n{table.text()}")
+    write_calibration(calibration, tables, out / "calibration.json")
+    write_figure5(calibration, out / "figure5.png")
+    if searched:
+        write_search(calibration, out / "search.png")
+    else:
+        write_figure4(calibration, out / "figure4.png")
+    click.echo(f"\n{summary_of(calibration)}\nWrote tables, figures and calibration.json to {out}")
 
 
 def _bead_table(
@@ -100,33 +123,28 @@ def _bead_table(
     figure: Callable[[np.ndarray], float],
 ) -> Table:
     """One figure of the errors of each stage's beads; the stiffness is the first row."""
-    names = [["", "", "stiffness"]]
-    figures: list[Row] = [[trial.setup.tissue.stiffness for trial in best]]
-    shares: list[Row] = [[None for _ in best]]
+    head, stiffness = ["case", "stage", "part"], [trial.setup.tissue.stiffness for trial in best]
+    table = Table(name, title, head, list(calibration.trials), [["", "", "stiffness"]], [stiffness])
+    table.shares.append([None for _ in best])
     for place, (case, fitted) in enumerate(zip(calibration.cases, calibration.split.fitted, strict=True)):
         for stage, depth in enumerate(case.indentation_mm):
             for part, used in ((FIT, fitted[stage]), (HELD_OUT, ~fitted[stage])):
                 if not used.any():
                     continue
                 row = [float(figure(trial.measured[place].errors[stage][used])) for trial in best]
-                names.append([case.name, f"{stage} ({depth:.2f} mm)", part])
-                figures.append([rounded(value) for value in row])
-                shares.append([rounded(100 * value / depth) if depth > 0 else None for value in row])
-    return Table(name, title, ["case", "stage", "part"], list(calibration.trials), names, figures, shares)
+                table.names.append([case.name, f"{stage} ({depth:.2f} mm)", part])
+                table.figures.append([rounded(value) for value in row])
+                table.shares.append([rounded(100 * v / depth) if depth > 0 else None for v in row])
+    return table
 
 
 def summary_of(calibration: Calibration) -> str:
     """The best settings of each radius, and their errors on the fitted and the held-out data."""
-    rows = []
-    for radius in calibration.trials:
-        best = calibration.best(radius)
-        setup = best.setup
-        settings = (setup.tissue.stiffness, setup.relaxation_factor, setup.iterations)
-        rows.append([radius, *settings, best.fit_mm, best.held_out_mm])
     split = calibration.split
+    rows = [dict(radius_mm=radius) | _trial(calibration.best(radius)) for radius in calibration.trials]
     lines = [
         f"Fitted on {split.fitted_name}; held out: {split.held_out_name}.",
-        text_table(SUMMARY_HEADERS, rows, ("g", ".3f", ".2f", "g", ".2f", ".2f")),
+        table_of(SUMMARY, rows),
         f"Held out, no motion after stage 0: {calibration.null_mm():.2f} mm.",
         "The column fit is no measure of accuracy; the column held out is, on data that was not fitted.",
     ]
@@ -136,7 +154,7 @@ def summary_of(calibration: Calibration) -> str:
 def write_calibration(calibration: Calibration, tables: list[Table], path: Path) -> None:
     """Write the split, all trials, the fits and the tables. Raises OSError."""
     split = calibration.split
-    found = dict(
+    report = dict(
         cases=[case.name for case in calibration.cases],
         fitted_on=split.fitted_name,
         held_out=split.held_out_name,
@@ -144,23 +162,20 @@ def write_calibration(calibration: Calibration, tables: list[Table], path: Path)
         radii=[_radius(calibration, radius) for radius in calibration.trials],
         tables=[asdict(table) for table in tables],
     )
-    write_json(found, path)
+    write_json(report, path)
 
 
 def _radius(calibration: Calibration, radius: float) -> dict:
     trials, best = calibration.trials[radius], calibration.best(radius)
     fit = quartic(trials)
+    coefficients = fit and fit[0].convert().coef.tolist()
     return dict(
         radius_mm=radius,
         particles=[measured.particles for measured in best.measured],
         clusters=[measured.clusters for measured in best.measured],
         best=_trial(best),
         quartic=fit
-        and dict(
-            coefficients=fit[0].convert().coef.tolist(),
-            stiffness=rounded(fit[1]),
-            fit_mm=rounded(fit[0](fit[1])),
-        ),
+        and dict(coefficients=coefficients, stiffness=rounded(fit[1]), fit_mm=rounded(fit[0](fit[1]))),
         trials=[_trial(trial) for trial in trials],
     )
 
@@ -181,7 +196,7 @@ def _times(calibration: Calibration, best: list[CalibrationTrial]) -> Table:
     spreads = [spread([ms for measured in trial.measured for ms in measured.step_ms]) for trial in best]
     rows = {"mean": "mean", "standard deviation": "sd", "minimum": "min", "maximum": "max"}
     title = "Table 5: time of a step in the calibration, on one CPU thread (ms)"
-    figures: list[Row] = [[each[key] for each in spreads] for key in rows.values()]
+    figures: list[Row] = [[ms[key] for ms in spreads] for key in rows.values()]
     return Table("table5", title, [""], list(calibration.trials), [[name] for name in rows], figures)
 
 
@@ -191,36 +206,34 @@ def _cell(figure: float | None, share: float | None) -> str:
 
 
 def write_figure4(calibration: Calibration, path: Path) -> None:
-    """Mean error over the stiffness for each radius, fitted and held out; quartics with a ring at the
-    minimum.
-    """
-    figure, left, right = _two_panels(calibration)
+    """Mean error over the stiffness for each radius, fitted and held out; quartics, a ring at the least."""
+    fitted, held_out = [], []
     for colour, radius in zip(_colours(calibration), calibration.trials, strict=True):
         trials = sorted(calibration.trials[radius], key=lambda trial: trial.setup.tissue.stiffness)
         at = [trial.setup.tissue.stiffness for trial in trials]
-        left.plot(at, [trial.fit_mm for trial in trials], ".", color=colour, label=f"{radius:g} mm")
-        right.plot(at, [trial.held_out_mm for trial in trials], ".-", color=colour, linewidth=0.8)
+        name, thin = f"{radius:g} mm", dict(color=colour, linewidth=0.8)
+        fitted.append(Curve(at, [trial.fit_mm for trial in trials], ".", name, dict(color=colour)))
+        held_out.append(Curve(at, [trial.held_out_mm for trial in trials], ".-", None, thin))
         fit = quartic(trials)
         if fit is not None:
             curve, best = fit
-            left.plot(*curve.linspace(200), "-", color=colour, linewidth=1)
-            left.plot(best, curve(best), "o", color=colour, markersize=9, fillstyle="none")
-    _finish(calibration, left, right, "stiffness α")
-    _save(figure, path)
+            ring = dict(color=colour, markersize=9, fillstyle="none")
+            fitted.append(Curve(*curve.linspace(200), "-", None, dict(color=colour, linewidth=1)))
+            fitted.append(Curve([best], [curve(best)], "o", None, ring))
+    _write_panels(calibration, fitted, held_out, "stiffness α", path)
 
 
 def write_search(calibration: Calibration, path: Path) -> None:
     """Error of the best setup so far over the evaluations, fitted and held out."""
-    figure, left, right = _two_panels(calibration)
+    fitted, held_out = [], []
     for colour, (radius, trials) in zip(_colours(calibration), calibration.trials.items(), strict=True):
-        best = best_so_far(trials)
-        left.plot([trial.fit_mm for trial in trials], ".", color=colour, alpha=0.35, markersize=4)
-        left.plot(
-            [trial.fit_mm for trial in best], color=colour, drawstyle="steps-post", label=f"{radius:g} mm"
-        )
-        right.plot([trial.held_out_mm for trial in best], color=colour, drawstyle="steps-post")
-    _finish(calibration, left, right, "setups tried")
-    _save(figure, path)
+        best, at = best_so_far(trials), range(len(trials))
+        faint = dict(color=colour, alpha=0.35, markersize=4)
+        steps = dict(color=colour, drawstyle="steps-post")
+        fitted.append(Curve(at, [trial.fit_mm for trial in trials], ".", None, faint))
+        fitted.append(Curve(at, [trial.fit_mm for trial in best], "-", f"{radius:g} mm", steps))
+        held_out.append(Curve(at, [trial.held_out_mm for trial in best], "-", None, steps))
+    _write_panels(calibration, fitted, held_out, "setups tried", path)
 
 
 def best_so_far(trials: list[CalibrationTrial]) -> list[CalibrationTrial]:
@@ -230,38 +243,34 @@ def best_so_far(trials: list[CalibrationTrial]) -> list[CalibrationTrial]:
 
 def write_figure5(calibration: Calibration, path: Path) -> None:
     """Particles and clusters over the radius, for each case."""
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    radii = list(calibration.trials)
-    for place, case in enumerate(calibration.cases):
-        measured = [calibration.trials[radius][0].measured[place] for radius in radii]
-        left.plot(radii, [each.particles for each in measured], "o-", label=case.name)
-        right.plot(radii, [each.clusters for each in measured], "o-", label=case.name)
-    for axes, what in ((left, "particles"), (right, "clusters")):
-        finish_axes(axes, {}, xlabel="particle radius (mm)", ylabel=what, ylim=(0, None))
+    figure, panels = panels_of((9, 4), 1, 2)
+    first = {radius: trials[0].measured for radius, trials in calibration.trials.items()}
+    for axes, what in zip(panels[0], ("particles", "clusters"), strict=True):
+        counts = [[getattr(measured, what) for measured in of_cases] for of_cases in first.values()]
+        curves = [
+            Curve(list(first), count, "o-", case.name)
+            for case, count in zip(calibration.cases, zip(*counts, strict=True), strict=True)
+        ]
+        draw_panel(axes, curves, {}, xlabel="particle radius (mm)", ylabel=what, ylim=(0, None))
     _save(figure, path)
 
 
-def _two_panels(calibration: Calibration) -> tuple[Figure, Axes, Axes]:
-    """A figure with a panel of errors on the fitted data and one on the held-out data."""
-    figure = Figure(figsize=(11, 4.6), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
-    left.set(title=f"Fit: {calibration.split.fitted_name}", ylabel="mean bead error (mm)")
-    right.set(title=f"Held out: {calibration.split.held_out_name}")
-    right.axhline(calibration.null_mm(), color="0.4", linestyle="--", label="no motion")
-    return figure, left, right
-
-
-def _finish(calibration: Calibration, left: Axes, right: Axes, x_label: str) -> None:
-    """Limits, legends and grids of both panels, once their curves are drawn."""
-    least = min(calibration.best(radius).fit_mm for radius in calibration.trials)
-    errors = [
-        error for trials in calibration.trials.values() for t in trials for error in (t.fit_mm, t.held_out_mm)
-    ]
+def _write_panels(
+    calibration: Calibration, fitted: list[Curve], held_out: list[Curve], x_label: str, path: Path
+) -> None:
+    """A panel of errors on the fitted data beside one on the held-out data."""
+    split, null_mm = calibration.split, calibration.null_mm()
+    figure, ((left, right),) = panels_of((11, 4.6), 1, 2, sharey=True)
+    right.axhline(null_mm, color="0.4", linestyle="--", label="no motion")
+    left.set(title=f"Fit: {split.fitted_name}", ylabel="mean bead error (mm)")
+    draw_panel(left, fitted, dict(title="particle radius"), xlabel=x_label)
+    draw_panel(right, held_out, {}, xlabel=x_label, title=f"Held out: {split.held_out_name}")
+    trials = [trial for trials in calibration.trials.values() for trial in trials]
+    errors = [error for trial in trials for error in (trial.fit_mm, trial.held_out_mm)]
     most = max(filter(np.isfinite, errors), default=1.0)
-    left.set_ylim(0, min(1.05 * most, MOST_ERROR * max(least, calibration.null_mm())))
-    finish_axes(left, dict(title="particle radius"), xlabel=x_label)
-    finish_axes(right, {}, xlabel=x_label)
+    least = min(trial.fit_mm for trial in trials)
+    left.set_ylim(0, min(1.05 * most, MOST_ERROR * max(least, null_mm)))
+    _save(figure, path)
 
 
 def _colours(calibration: Calibration) -> list:

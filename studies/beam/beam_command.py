@@ -14,7 +14,7 @@ from rehearsal.result_files import save_figure
 from studies.beam.beam_comparison import check, compare, figure_of, table
 from studies.beam.cantilever import ITERATIONS, REST_RELAXATION, REST_TOLERANCE_MM, BeamMaterial, Cantilever
 from studies.beam.motion_capture import BeamError, load_captures
-from studies.study_options import number_option
+from studies.study import number_option
 
 BEAM = "beam.stl"
 DPI = 110

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 from studies.beam.cantilever import ITERATIONS, BeamMaterial, Cantilever
 from studies.beam.motion_capture import BeamError, Capture, Oscillation, oscillation
-from studies.study_results import table_of
+from studies.tables_and_panels import Curve, draw_panel, panels_of, table_of
 
 FRAME_S = 0.01
 # Computed duration, in periods of beam theory.
@@ -112,9 +112,7 @@ def computed_oscillation(beam: Cantilever, trace: np.ndarray) -> Oscillation:
 
 
 def mean_length(displacement_mm: np.ndarray) -> float:
-    """Mean length [mm] of the markers' displacements (n, 3); independent of the frames of capture and
-    beam.
-    """
+    """Mean length [mm] of the markers' displacements (n, 3), which is the same in any frame."""
     return float(np.linalg.norm(displacement_mm, axis=1).mean())
 
 
@@ -129,14 +127,11 @@ def measured_oscillation(capture: Capture) -> Oscillation:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Final displacement of the tip, first frequency and damping ratio of each load."""
-    off = [
-        {
-            f"off_{unit}": 100 * (row[f"computed_{unit}"] / row[f"measured_{unit}"] - 1)
-            for unit in ("mm", "hz")
-        }
-        for row in rows
-    ]
-    return table_of(COLUMNS, [row | more for row, more in zip(rows, off, strict=True)])
+    described = []
+    for row in rows:
+        ratios = {unit: row[f"computed_{unit}"] / row[f"measured_{unit}"] for unit in ("mm", "hz")}
+        described.append(row | {f"off_{unit}": 100 * (ratio - 1) for unit, ratio in ratios.items()})
+    return table_of(COLUMNS, described)
 
 
 def check(build: Callable[..., Cantilever], cell_mm: float, load_g: float, time_s: np.ndarray) -> str:
@@ -176,19 +171,17 @@ def check(build: Callable[..., Cantilever], cell_mm: float, load_g: float, time_
 
 def figure_of(groups: list[list[Capture]], traces: list[np.ndarray], rows: list[dict[str, Any]]) -> Figure:
     """Tip height over time, measured and computed, a panel a load."""
-    figure = Figure(figsize=(11, 3.2 * len(rows)), layout="constrained")
-    panels = figure.subplots(len(rows), squeeze=False)[:, 0]
-    for axes, captures, trace, row in zip(panels, groups, traces, rows, strict=True):
+    figure, panels = panels_of((11, 3.2 * len(rows)), len(rows))
+    for axes, captures, trace, row in zip(panels[:, 0], groups, traces, rows, strict=True):
+        curves = []
         for capture in captures:
             first = capture.release()
             time_s = capture.time_s[first:] - capture.time_s[first]
-            axes.plot(time_s, capture.height_mm()[first:], label=capture.name)
-        axes.plot(*trace, "k--", lw=1, label="computed, undamped")
+            curves.append(Curve(time_s, capture.height_mm()[first:], "-", capture.name))
+        curves.append(Curve(trace[0], trace[1], "k--", "computed, undamped", dict(lw=1)))
+        draw_panel(axes, curves, dict(loc="upper right", fontsize=8), ylabel="tip height, mm")
         axes.set_xlim(0, 1.2 * trace[0, -1])
-        axes.set_ylabel("tip height, mm")
         measured, computed = f"measured {row['measured_hz']:.2f} Hz", f"computed {row['computed_hz']:.2f} Hz"
         axes.set_title(f"{row['load_g']:.0f} g at the tip: {measured}, {computed}", loc="left")
-        axes.grid(alpha=0.3)
-        axes.legend(loc="upper right", fontsize=8)
-    panels[-1].set_xlabel("time since the release, s")
+    panels[-1, 0].set_xlabel("time since the release, s")
     return figure

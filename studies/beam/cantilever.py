@@ -131,9 +131,7 @@ class Cantilever:
         return self._settle(REST_ITERATIONS)
 
     def _settle(self, iterations: int) -> tuple[np.ndarray, float]:
-        """Over-relaxed steps of 1 s, in which inertia is negligible, each with as many iterations as all
-        before it.
-        """
+        """Over-relaxed steps of 1 s, of negligible inertia, each with as many iterations as all before it."""
         total, left = 0, np.inf
         before = self.displacement()
         while left > REST_TOLERANCE_MM and total < MOST_REST_ITERATIONS:
@@ -153,9 +151,7 @@ class Cantilever:
     def swing(
         self, frames: int, frame_s: float, substeps: int | None = None, iterations: int | None = None
     ) -> np.ndarray:
-        """Marker displacements (frames + 1, n, 3) [mm] after a release from straight, the first at the
-        release.
-        """
+        """Marker displacements (frames + 1, n, 3) [mm] from a release from straight on."""
         self.body.restore(self.body.rest_state())
         substeps = substeps or self.substeps(frame_s)
         steps = -(-substeps // MOST_SUBSTEPS)

@@ -141,7 +141,7 @@ def _fit(time_s: np.ndarray, height_mm: np.ndarray, period: float) -> tuple[floa
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", OptimizeWarning)
-            found = curve_fit(model, time_s, height_mm, guess, maxfev=5000)[0]
+            fitted = curve_fit(model, time_s, height_mm, guess, maxfev=5000)[0]
     except (RuntimeError, TypeError, ValueError):
         raise BeamError("no damped oscillation fits the signal") from None
-    return abs(float(found[3])), float(found[2])
+    return abs(float(fitted[3])), float(fitted[2])

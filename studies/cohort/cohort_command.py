@@ -10,10 +10,9 @@ from itertools import chain
 from pathlib import Path
 
 import click
-from tqdm import tqdm
 
 from errors import UserError
-from rehearsal.commands.command_line import load_patient, make_folder
+from rehearsal.commands.command_line import load_patient
 from rehearsal.configuration import probe_of
 from rehearsal.planning.plan_file import write_plan
 from rehearsal.planning.sweep_trial import PlanningProblem
@@ -24,7 +23,7 @@ from scenes.surfaces import volume_mm3
 from scenes.tissue import QUALITIES
 from studies.cohort.cohort_table import CohortFile, PatientRow, read_rows, text_of, write_rows
 from studies.cohort.patient_run import MEASURED, PatientResult, run_patient
-from studies.study_options import dask_option, jobs_option, out_option, trials_option
+from studies.study import Study, paths_argument, study_command, trials_option
 from ultrasound.target import Target
 from version import VERSION
 
@@ -43,38 +42,29 @@ class CohortPatient:
     folder: Path
 
 
-@click.command()
-@click.argument(
-    "folders", metavar="FOLDER...", type=click.Path(path_type=Path, readable=False), nargs=-1, required=True
+@study_command(
+    "cohort",
+    paths_argument("folders", "FOLDER...", required=True),
+    click.option(
+        "--quality", type=click.Choice(QUALITIES), help="A preset of the tissue model [each scene's]."
+    ),
+    trials_option,
+    has_workers=True,
 )
-@out_option
-@click.option("--quality", type=click.Choice(QUALITIES), help="A preset of the tissue model [each scene's].")
-@trials_option
-@jobs_option
-@dask_option
-def cohort(
-    folders: tuple[Path, ...],
-    out: Path,
-    quality: str | None,
-    trials: int,
-    jobs: int | None,
-    dask: str | None,
-) -> None:
+def cohort(study: Study, folders: tuple[Path, ...], quality: str | None, trials: int) -> None:
     """Settle, press and plan for each patient, in one table.
 
     FOLDER... are patients' folders or scene files. Started again with the same --out, it goes on where it was
     interrupted.
     """
     folders = without_system_files(folders)
-    make_folder(out)
-    earlier = read_rows(out)
-    with tqdm(total=len(folders), desc="cohort", unit="patient") as bar:
-        study = CohortStudy(out, trials, earlier, bar.update)
-        study.run(folders, quality, jobs, dask)
-    write_csv([row.model_dump() for row in study.rows()], out / "cohort.csv")
-    click.echo(
-        f"\n{text_of(study.rows())}\n\nWrote cohort.json, cohort.csv, and report and plan of each to {out}"
-    )
+    earlier = read_rows(study.out)
+    with study.progress(len(folders), "patient") as bar:
+        patients = CohortStudy(study.out, trials, earlier, bar.update)
+        patients.run(folders, quality, study.jobs, study.dask)
+    write_csv([row.model_dump() for row in patients.rows()], study.out / "cohort.csv")
+    written = f"Wrote cohort.json, cohort.csv, and report and plan of each to {study.out}"
+    click.echo(f"\n{text_of(patients.rows())}\n\n{written}")
 
 
 class CohortStudy:
@@ -125,9 +115,9 @@ class CohortStudy:
         error = error_of(future)
         if error is None:
             self._write(self._written(patient.row, future.result()))
-        else:
-            message = ENDED_MESSAGE if has_ended(error) else _message_of(error, patient.folder)
-            self._write(patient.row.model_copy(update=dict(message=message)))
+            return
+        message = ENDED_MESSAGE if has_ended(error) else _message_of(error, patient.folder)
+        self._write(patient.row.model_copy(update=dict(message=message)))
 
     def _written(self, row: PatientRow, result: PatientResult) -> PatientRow:
         """Write report and plan of a patient; the row of the table."""
@@ -143,9 +133,12 @@ class CohortStudy:
         command line, stay.
         """
         self._rows.append(row)
-        reached = {each.key for each in self._rows}
-        kept = [each for each in read_rows(self.out) if each.state != "failed" and each.key not in reached]
-        others = [each.model_copy(update=dict(patient=None)) for each in kept]
+        reached = {row.key for row in self._rows}
+        others = [
+            earlier.model_copy(update=dict(patient=None))
+            for earlier in read_rows(self.out)
+            if earlier.state != "failed" and earlier.key not in reached
+        ]
         write_rows(CohortFile(version=VERSION, patients=[*self.rows(), *others]), self.out)
         self._done()
 
@@ -192,24 +185,22 @@ def in_workers(
 
 def _described(row: PatientRow, problem: PlanningProblem) -> PatientRow:
     """What is known of a patient before anything is computed."""
-    scene, organ, tumour = problem.scene, problem.anatomy.organ, problem.anatomy.tumour
-    values = scene.model_dump(
+    # The probe itself, and not the path of its file.
+    values = problem.scene.model_dump(
         mode="json", exclude={"title": True, "uncertainty": True, "transducer": {"probe"}}
     )
-    # The probe itself, and not the path of its file.
-    settings = (
-        json.dumps(values),
-        problem.probe.model_dump_json(),
-        problem.fingerprint,
-        str(row.trials),
-        VERSION,
+    probe = problem.probe.model_dump_json()
+    settings = (json.dumps(values), probe, problem.fingerprint, str(row.trials), VERSION)
+    kidney_ml, tumour_ml = (
+        None if surface is None else rounded(volume_mm3(surface.vertices, surface.faces) / 1000)
+        for surface in (problem.anatomy.organ, problem.anatomy.tumour)
     )
     return row.model_copy(
         update=dict(
-            title=_printable(scene.title),
+            title=_printable(problem.scene.title),
             key=hashlib.sha256("\n".join(settings).encode()).hexdigest()[:12],
-            kidney_ml=rounded(volume_mm3(organ.vertices, organ.faces) / 1000),
-            tumour_ml=None if tumour is None else rounded(volume_mm3(tumour.vertices, tumour.faces) / 1000),
+            kidney_ml=kidney_ml,
+            tumour_ml=tumour_ml,
         )
     )
 

@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from errors import UserError, explained
 from rehearsal.result_files import write_json
-from studies.study_results import table_of
+from studies.tables_and_panels import table_of
 from text_files import TextError, read_text
 
 FILE = "cohort.json"
@@ -105,7 +105,7 @@ def write_rows(table: CohortFile, folder: Path) -> None:
 
 def text_of(rows: list[PatientRow]) -> str:
     """The table, and the message of each patient who has one."""
-    table = table_of(COLUMNS.items(), [row.model_dump() for row in rows])
-    said = [f"patient {row.patient}: {row.message}" for row in rows if row.message]
+    table = table_of(COLUMNS, [row.model_dump() for row in rows])
+    messages = [f"patient {row.patient}: {row.message}" for row in rows if row.message]
     done = sum(row.state == "done" for row in rows)
-    return "\n".join([table, "", f"{done} of {len(rows)} patients are done.", *said])
+    return "\n".join([table, "", f"{done} of {len(rows)} patients are done.", *messages])

@@ -69,8 +69,8 @@ def press(rehearsal: Rehearsal, build_s: float) -> dict[str, Any]:
             tally.add(rehearsal, rehearsal.do(Move(pose=rehearsal.scripted_pose(step * dt))))
         if not tally.finite:
             break
-        found = measure(anatomy, case.probe, touches)
-        measured = {name: rounded(getattr(found, name)) for name in MEASURED}
+        measurement = measure(anatomy, case.probe, touches)
+        measured = {name: rounded(getattr(measurement, name)) for name in MEASURED}
         stages.append(measured | dict(indentation_mm=depth_mm))
     settled = rounded(np.linalg.norm(shift, axis=1).max())
     return tally.report(rehearsal, "cpu") | dict(settled_shift_mm=settled, stages=stages)

@@ -1,29 +1,26 @@
 """The command ``study echo``: the B-mode image of virtual test objects beside SIMUS."""
 
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-import click
 import numpy as np
 
-from rehearsal.commands.command_line import make_folder, start_taichi
-from studies.echo.echo_rows import CYST_RADIUS_MM, DEPTHS_MM, LEVEL_BAR_DB, SHIFT_BAR, WIDTH_BAR, Row, rows
+from studies.echo.echo_rows import CYST_RADIUS_MM, LEVEL_BAR_DB, SHIFT_BAR, WIDTH_BAR, Row, rows
 from studies.echo.simus_beam import pymust
-from studies.study_options import out_option
-from studies.study_results import finish_axes, table_of, write_results
+from studies.study import Results, Study, study_command
+from studies.tables_and_panels import curves_by, draw_panel, panels_of, table_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COLUMNS = (
-    ("quantity", "{name}"),
-    ("ours", "{ours:.3g}"),
-    ("reference", "{reference:.3g}"),
-    ("unit", "{unit}"),
-    ("within", "{within}"),
-    ("if not, why", "{reason}"),
-)
+COLUMNS = {
+    "quantity": "{name}",
+    "ours": "{ours:.3g}",
+    "reference": "{reference:.3g}",
+    "unit": "{unit}",
+    "within": "{within}",
+    "if not, why": "{reason}",
+}
 QUANTITIES = {
     "lateral width": "Width of a point [mm]",
     "elevational travel": "Travel to half of speckle correlation [mm]",
@@ -32,34 +29,30 @@ QUANTITIES = {
 }
 
 
-@click.command()
-@out_option
-def echo(out: Path) -> None:
+@study_command("echo", arch="cpu")
+def echo(study: Study) -> Results:
     """Compare the B-mode image with an independent wave simulator.
 
     Virtual test objects are imaged with each included probe, and the same arrays are simulated by SIMUS
     (package pymust). Two minutes.
     """
     pymust()
-    make_folder(out)
-    backend = start_taichi("cpu")
-    found = list(rows())
-    described = [_described(row) for row in found]
-    outside = sum(not row.is_within for row in found)
+    compared = list(rows())
+    described = [_described(row) for row in compared]
+    within = sum(row.is_within for row in compared)
     text = (
-        f"{table_of(COLUMNS, described)}\n\n{len(found) - outside} of {len(found)} within "
-        f"{100 * WIDTH_BAR:g} % "
+        f"{table_of(COLUMNS, described)}\n\n{within} of {len(compared)} within {100 * WIDTH_BAR:g} % "
         f"(lengths) or {LEVEL_BAR_DB:g} dB (levels) of SIMUS, or {100 * SHIFT_BAR:g} % of the Doppler "
         "equation"
     )
     report = dict(
-        backend=backend,
+        backend=study.backend,
         length_bar=WIDTH_BAR,
         level_bar_db=LEVEL_BAR_DB,
         shift_bar=SHIFT_BAR,
-        rows=[asdict(row) | {"within": row.is_within} for row in found],
+        rows=[asdict(row) | {"within": row.is_within} for row in compared],
     )
-    write_results(out, "echo", report, text, described, figure_of(found))
+    return Results(report, text, described, figure_of(compared))
 
 
 def _described(row: Row) -> dict[str, object]:
@@ -69,23 +62,18 @@ def _described(row: Row) -> dict[str, object]:
     }
 
 
-def figure_of(found: list[Row]) -> "Figure":
+def figure_of(compared: list[Row]) -> "Figure":
     """Ours against the reference, a panel for each kind of quantity."""
-    from matplotlib.figure import Figure
-
-    figure = Figure((11, 10), layout="constrained")
-    for axes, (part, title) in zip(figure.subplots(2, 2).flat, QUANTITIES.items(), strict=True):
-        chosen = [row for row in found if part in row.name]
+    figure, panels = panels_of((11, 10), 2, 2)
+    for axes, (part, title) in zip(panels.flat, QUANTITIES.items(), strict=True):
+        chosen = [asdict(row) | {"probe": row.name.split(",")[0]} for row in compared if part in row.name]
         if not chosen:
             continue
-        reference = np.array([row.reference for row in chosen])
-        for name in [*DEPTHS_MM]:
-            own = [row for row in chosen if row.name.startswith(name)]
-            if own:
-                axes.plot([row.reference for row in own], [row.ours for row in own], "o", label=name)
-        ends = np.array([reference.min(), reference.max()])
+        curves = curves_by(chosen, "reference", "ours", "probe", "o")
+        reference = [row["reference"] for row in chosen]
+        ends = np.array([min(reference), max(reference)])
         bar = LEVEL_BAR_DB if "dB" in title else WIDTH_BAR * ends
         axes.plot(ends, ends, color="grey", lw=0.8)
         axes.fill_between(ends, ends - bar, ends + bar, color="grey", alpha=0.2, lw=0)
-        finish_axes(axes, dict(fontsize=8), title=title, xlabel="SIMUS", ylabel="Nephron")
+        draw_panel(axes, curves, dict(fontsize=8), title=title, xlabel="SIMUS", ylabel="Nephron")
     return figure

@@ -55,8 +55,8 @@ class EchoPhantom:
         self.bmode.sound.surface = surface
 
     def vessel_velocity(self, speed_cm_s: float, angle_deg: float, depth_mm: float) -> np.ndarray:
-        """Return the velocities [cm/s] that Doppler finds in a straight vessel whose flow has an angle to
-        the direction of the array.
+        """Velocities [cm/s] that Doppler finds in a straight vessel whose flow has an angle to the direction
+        of the array.
         """
         turn = np.radians(angle_deg)
         along = np.array([np.sin(turn), -np.cos(turn)])
@@ -69,22 +69,22 @@ class EchoPhantom:
         self.amplitude()
         if self.doppler is None:
             self.doppler = Doppler(self.bmode.sound, self.bmode, self.flow)
-        found = []
+        velocities = []
         for beat in range(BEATS):
             self.doppler.estimate(self.probe, SYSTOLE_S + beat * BEAT_S)
-            found.append(self.doppler.velocity_cm_s(self.probe))
+            velocities.append(self.doppler.velocity_cm_s(self.probe))
         middle = self.probe.number_of_scanlines // 2
         step_mm = self.bmode.sound.stride_of(self.probe) * self.probe.sample_mm
         sample = round(depth_mm / step_mm)
-        return np.stack(found)[:, middle - 4 : middle + 5, sample - 1 : sample + 2]
+        return np.stack(velocities)[:, middle - 4 : middle + 5, sample - 1 : sample + 2]
 
     def fill(
         self, impedance: Values = IMPEDANCE, attenuation: Values = 0.0, backscatter: Values = 0.0
     ) -> None:
         """Set impedance [MRayl], attenuation [dB/cm/MHz] and backscatter."""
         values = np.zeros((*self.u.shape, 1, 4), np.float32)
-        for channel, given in enumerate((impedance, attenuation, backscatter)):
-            values[..., 0, channel] = given(self.u, self.v) if callable(given) else given
+        for channel, quantity in enumerate((impedance, attenuation, backscatter)):
+            values[..., 0, channel] = quantity(self.u, self.v) if callable(quantity) else quantity
         fill((self.tissue.voxels, _thin(values)))
 
     def amplitude(
@@ -93,9 +93,7 @@ class EchoPhantom:
         detail_level: DetailLevel = "speckle",
         probe: Probe | None = None,
     ) -> np.ndarray:
-        """Return the echo (scanlines, samples) without gain, of a probe that is moved out of its image
-        plane.
-        """
+        """Echo (scanlines, samples) without gain, of a probe that is moved out of its image plane."""
         probe = probe or self.probe
         place = np.array([0.0, 0.0, across_mm])
         pose = pose_at(place, np.array([0.0, 1, 0]), np.array([1.0, 0, 0]), probe.housing_mm[2])
@@ -104,9 +102,7 @@ class EchoPhantom:
         return 10 ** ((array_of(self.bmode.decibel).astype(float) - probe.gain_db()) / 20)
 
     def point_response(self, scanline: int, depth_mm: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return distance [mm] along an arc and amplitude on each scanline of a point scatterer on one of
-        them.
-        """
+        """Distance [mm] along an arc and amplitude on each scanline of a point on one of them."""
         self.fill()
         self.amplitude()
         spacing = float(self.probe.line_spacing_mm(np.array([depth_mm]))[0])
@@ -121,5 +117,5 @@ class EchoPhantom:
 
 
 def _thin(values: np.ndarray) -> np.ndarray:
-    """Return voxels (nx, ny, 1, c) as a field of a thin ``SampledVolume`` has them."""
+    """Voxels (nx, ny, 1, c) as a field of a thin ``SampledVolume`` has them."""
     return np.pad(values, [(0, 0), (0, 0), (0, 1), (0, 0)], mode="edge").reshape(-1, values.shape[-1])

@@ -103,11 +103,8 @@ def edge_width(phantom: EchoPhantom, name: str) -> Iterator[Row]:
     """The same 1 mm from the end of the array."""
     probe, depth = phantom.probe, 18.0
     scanline = round(probe.number_of_scanlines * (1 - 1.0 / probe.array_width_mm) - 0.5)
-    place, amplitude = phantom.point_response(scanline, depth)
-    # Beyond the array there are no scanlines: twice the inner half.
-    width = 2 * np.interp(-0.5, -(amplitude / amplitude[scanline])[scanline::-1], -place[scanline::-1])
-    reference = _simus_width(_beam(probe, scanline=scanline), depth, 2.0)
-    yield Row(f"{name}, lateral width at {depth:g} mm, 1 mm from the edge", float(width), reference, "mm")
+    text = f"{name}, lateral width at {depth:g} mm, 1 mm from the edge"
+    yield _inner_width(phantom, text, scanline, depth, 2.0)
 
 
 def steered_width(phantom: EchoPhantom, name: str) -> Iterator[Row]:
@@ -115,23 +112,26 @@ def steered_width(phantom: EchoPhantom, name: str) -> Iterator[Row]:
     probe, depth, angle = phantom.probe, 65.0, 38.0
     share = (angle - probe.theta_start_deg) / (probe.theta_stop_deg - probe.theta_start_deg)
     scanline = round(share * probe.number_of_scanlines - 0.5)
-    place, amplitude = phantom.point_response(scanline, depth)
+    text = f"{name}, lateral width at {depth:g} mm, steered {angle:g} degrees"
+    yield _inner_width(phantom, text, scanline, depth, 5.0)
+
+
+def _inner_width(phantom: EchoPhantom, text: str, scanline: int, depth_mm: float, reach_mm: float) -> Row:
+    """Twice the inner half of the width: beyond the array there are no scanlines."""
+    place, amplitude = phantom.point_response(scanline, depth_mm)
     width = 2 * np.interp(-0.5, -(amplitude / amplitude[scanline])[scanline::-1], -place[scanline::-1])
-    reference = _simus_width(_beam(probe, scanline=scanline), depth, 5.0)
-    yield Row(
-        f"{name}, lateral width at {depth:g} mm, steered {angle:g} degrees", float(width), reference, "mm"
-    )
+    return Row(text, width, _simus_width(_beam(phantom.probe, scanline=scanline), depth_mm, reach_mm), "mm")
 
 
 def elevation_curve(phantom: EchoPhantom, depth_mm: float, step_mm: np.ndarray) -> np.ndarray:
-    """Return how speckle intensity at a depth correlates with that of planes some steps away."""
+    """How speckle intensity at a depth correlates with that of planes some steps away."""
     phantom.fill(backscatter=0.1)
     part = np.abs(phantom.depth_mm - depth_mm) < 0.05 * phantom.probe.depth_mm
     curves = []
     for origin in np.random.default_rng(SEED).uniform(-200, 200, 10):
         frames = [phantom.amplitude(origin + step)[:, part] ** 2 for step in step_mm]
-        frames = [each - each.mean() for each in frames]
-        curves.append([(frames[0] * each).mean() for each in frames] / (frames[0] ** 2).mean())
+        frames = [frame - frame.mean() for frame in frames]
+        curves.append([(frames[0] * frame).mean() for frame in frames] / (frames[0] ** 2).mean())
     return np.mean(curves, axis=0)
 
 
@@ -146,14 +146,9 @@ def elevation_lengths(phantom: EchoPhantom, name: str) -> Iterator[Row]:
         step = np.linspace(0, 2.5 * reference, 16)
         curve = elevation_curve(phantom, depth, step)
         below = int(np.argmax(curve < 0.5))
-        found = np.interp(-0.5, -curve[: below + 1], step[: below + 1])
-        yield Row(
-            f"{name}, elevational travel to half correlation at {depth:g} mm",
-            float(found),
-            reference,
-            "mm",
-            NEAR_FIELD,
-        )
+        travel = np.interp(-0.5, -curve[: below + 1], step[: below + 1])
+        text = f"{name}, elevational travel to half correlation at {depth:g} mm"
+        yield Row(text, travel, reference, "mm", NEAR_FIELD)
 
 
 def speckle_statistics(phantom: EchoPhantom, name: str) -> Iterator[Row]:
@@ -162,7 +157,7 @@ def speckle_statistics(phantom: EchoPhantom, name: str) -> Iterator[Row]:
     depth, part = 18.0, np.abs(phantom.depth_mm - 18.0) < 2.0
     images = [phantom.amplitude(at) for at in np.random.default_rng(SEED).uniform(-200, 200, 10)]
     amplitude = np.array([image[24:-24, part] for image in images])
-    snr = float(np.mean([speckle_snr(each) for each in amplitude]))
+    snr = float(np.mean([speckle_snr(image) for image in amplitude]))
     yield Row(f"{name}, speckle: mean over SD (Rayleigh)", snr, RAYLEIGH_SNR, "")
     beam, place = _beam(phantom.probe), np.linspace(-2, 2, 161)
     _, along = beam.echoes(beam.points(place, depth), depth)
@@ -172,8 +167,8 @@ def speckle_statistics(phantom: EchoPhantom, name: str) -> Iterator[Row]:
         ("laterally", 1, spacing, half_correlation(along, place[1] - place[0])),
         ("axially", 2, phantom.probe.sample_mm, half_correlation(axial.T, 0.02)),
     ):
-        found = step * correlation_length(amplitude, axis)
-        yield Row(f"{name}, speckle to half correlation {way}", found, reference, "mm")
+        length = step * correlation_length(amplitude, axis)
+        yield Row(f"{name}, speckle to half correlation {way}", length, reference, "mm")
 
 
 def interfaces(phantom: EchoPhantom, name: str) -> Iterator[Row]:
@@ -214,35 +209,33 @@ def interfaces(phantom: EchoPhantom, name: str) -> Iterator[Row]:
         phantom.set_surface(surface)
         straight = ours(0), reference(0, height)
         for tilt in TILTS_DEG:
-            found = 10 * np.log10(ours(tilt) / straight[0])
+            level = 10 * np.log10(ours(tilt) / straight[0])
             simulated = 10 * np.log10(reference(tilt, height) / straight[1])
             reason = INVISIBLE if tilt >= 20 else ""
-            yield Row(f"{name}, {text} interface tilted {tilt} degrees", found, simulated, "dB", reason)
+            yield Row(f"{name}, {text} interface tilted {tilt} degrees", level, simulated, "dB", reason)
     phantom.set_surface(Surface())
 
 
 def cysts(phantom: EchoPhantom, name: str) -> Iterator[Row]:
-    """Level in the middle of an anechoic cylinder across the image plane, relative to the tissue around
-    it.
-    """
+    """Level in an anechoic cylinder across the image plane, relative to the tissue around it."""
     beam, draw, count = _beam(phantom.probe, False), np.random.default_rng(SEED), CYST_POINTS
+    middle = phantom.probe.number_of_scanlines // 2
     for depth in DEPTHS_MM[name]:
-        phantom.fill(backscatter=0.1 * (np.hypot(phantom.u, phantom.v - depth) > CYST_RADIUS_MM))
-        near, middle = np.abs(phantom.depth_mm - depth) < 0.5, phantom.probe.number_of_scanlines // 2
+        near = np.abs(phantom.depth_mm - depth) < 0.5
         places = np.random.default_rng(SEED).uniform(-200, 200, 12)
-        inside = np.mean([phantom.amplitude(at)[middle - 3 : middle + 3, near] ** 2 for at in places])
-        phantom.fill(backscatter=0.1)
-        outside = np.mean([phantom.amplitude(at)[middle - 3 : middle + 3, near] ** 2 for at in places])
+
+        def energy(backscatter: np.ndarray | float) -> np.ndarray:
+            phantom.fill(backscatter=backscatter)
+            return np.mean([phantom.amplitude(at)[middle - 3 : middle + 3, near] ** 2 for at in places])
+
+        inside = energy(0.1 * (np.hypot(phantom.u, phantom.v - depth) > CYST_RADIUS_MM))
+        level = 10 * np.log10(inside / energy(0.1))
         u, v = draw.uniform(-7, 7, count), depth + draw.uniform(-3, 3, count)
         at, echoes = beam.echoes(beam.points(u, v), depth, window_mm=4.0)
-        energy = (np.abs(echoes[:, np.abs(at - depth) < 0.5]) ** 2).mean(axis=1)
-        reference = energy[np.hypot(u, v - depth) > CYST_RADIUS_MM].sum() / energy.sum()
-        yield Row(
-            f"{name}, cyst of {2 * CYST_RADIUS_MM:g} mm at {depth:g} mm",
-            10 * np.log10(inside / outside),
-            10 * np.log10(reference),
-            "dB",
-        )
+        simulated = (np.abs(echoes[:, np.abs(at - depth) < 0.5]) ** 2).mean(axis=1)
+        beside = simulated[np.hypot(u, v - depth) > CYST_RADIUS_MM].sum()
+        text = f"{name}, cyst of {2 * CYST_RADIUS_MM:g} mm at {depth:g} mm"
+        yield Row(text, level, 10 * np.log10(beside / simulated.sum()), "dB")
 
 
 def attenuation(phantom: EchoPhantom, name: str) -> Iterator[Row]:
@@ -261,21 +254,19 @@ def attenuation(phantom: EchoPhantom, name: str) -> Iterator[Row]:
         lost = 20 * np.log10(np.divide(levels[1], levels[0]))
         text = f"{name}, {frequency:g} MHz, 36 mm at 1 dB/cm/MHz"
         yield Row(f"{text}: loss", lost[0], lost[1], "dB")
-        for when, (found, reference) in zip(("without", "with"), lengths, strict=True):
-            yield Row(f"{text}: length of the pulse {when} it", found, reference, "mm")
+        for when, (ours, reference) in zip(("without", "with"), lengths, strict=True):
+            yield Row(f"{text}: length of the pulse {when} it", ours, reference, "mm")
 
 
 def doppler_shifts(phantom: EchoPhantom, name: str) -> Iterator[Row]:
     """Doppler shift of a vessel, against 2 f v cos(angle) / c."""
     probe, depth = phantom.probe, DEPTHS_MM[name][1]
     for angle in FLOW_ANGLES_DEG:
-        found = float(phantom.vessel_velocity(BLOOD_CM_S, angle, depth).mean())
-        yield Row(
-            f"{name}, Doppler shift of {BLOOD_CM_S:g} cm/s at {angle} degrees (by 2 f v cos / c)",
-            doppler_shift_khz(probe, found),
-            doppler_shift_khz(probe, BLOOD_CM_S * np.cos(np.radians(angle))),
-            "kHz",
-        )
+        velocity = float(phantom.vessel_velocity(BLOOD_CM_S, angle, depth).mean())
+        along = BLOOD_CM_S * np.cos(np.radians(angle))
+        ours, equation = (doppler_shift_khz(probe, speed) for speed in (velocity, along))
+        text = f"{name}, Doppler shift of {BLOOD_CM_S:g} cm/s at {angle} degrees (by 2 f v cos / c)"
+        yield Row(text, ours, equation, "kHz")
 
 
 def _length(depth: np.ndarray, amplitude: np.ndarray) -> float:

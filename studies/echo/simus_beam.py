@@ -26,7 +26,7 @@ class EchoStudyError(UserError):
 
 
 def pymust() -> Any:
-    """Return the package. Raises EchoStudyError."""
+    """The package. Raises EchoStudyError."""
     try:
         import pymust
     except ImportError:
@@ -58,9 +58,7 @@ class SimusBeam:
     def points(
         self, along_mm: np.ndarray, depth_mm: np.ndarray | float, across_mm: np.ndarray | float = 0.0
     ) -> np.ndarray:
-        """Return points (n, 3) beside the scanline: lateral along an arc, depth and out of the image plane
-        [mm].
-        """
+        """Points (n, 3) beside the scanline: lateral along an arc, depth and out of the image plane [mm]."""
         along, depth, across = np.broadcast_arrays(along_mm, depth_mm, across_mm)
         if self.probe.sector is None:
             return np.column_stack([self.place + along, across, depth])
@@ -73,8 +71,7 @@ class SimusBeam:
     def echoes(
         self, points: np.ndarray, depth_mm: float, attenuation_db_cm_mhz: float = 0.0, window_mm: float = 6.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return depths [mm] around that of reception, and the complex echo of each point (n, 3) there, (n,
-        depths).
+        """Depths [mm] around that of reception, and the complex echo of each point (n, 3) there, (n, depths).
 
         Points must be within the window around the depth, as later echoes overlap.
         """
@@ -97,9 +94,7 @@ class SimusBeam:
     def _spectrum(
         self, points: np.ndarray, half_mm: float, focus_mm: float, step_hz: float, attenuation: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return frequencies [Hz] and the field (frequencies, n) at points of an aperture focused on the
-        scanline.
-        """
+        """Frequencies [Hz] and the field (frequencies, n) at points of an aperture with a focus."""
         probe = self.probe
         chosen = self.elements
         if not self.is_phased:
@@ -123,23 +118,21 @@ class SimusBeam:
         options = self.must.utils.Options()
         options.dBThresh, options.WaitBar = THRESHOLD_DB, False
         options.FrequencyStep = step_hz * (longest + delays.max())
-        columns = [1e-3 * each[:, None] for each in (x, y, z)]
+        columns = [1e-3 * axis[:, None] for axis in (x, y, z)]
         if not self.has_elevation:
             columns[1] = None  # type: ignore[call-overload]
-        _, found, kept = self.must.pfield(*columns, delays, parameters, options=options)
+        _, pressure, kept = self.must.pfield(*columns, delays, parameters, options=options)
         self.parameters = parameters
         frequency = np.linspace(0, 2 * parameters.fc, len(kept))
         field = np.zeros((len(kept), len(points)), complex)
-        field[kept] = found[:, 0, :].T
+        field[kept] = pressure[:, 0, :].T
         # Time counts from the focus.
         return frequency, field * np.exp(-2j * np.pi * frequency * to_focus.max())[:, None]
 
     def _in_aperture(
         self, points: np.ndarray, chosen: np.ndarray, middle: float, focus_mm: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
-        """Return x, y, z of points, focus (2,) and elements (e, 2) in the axes of an aperture as SIMUS has
-        them, and its radius.
-        """
+        """Points x, y, z, focus (2,) and elements (e, 2) in SIMUS's axes of an aperture, its radius."""
         x, y, z = points.T.astype(float)
         radius = self.probe.radius_mm
         if not radius:
@@ -157,8 +150,7 @@ class SimusBeam:
 
 
 def half_correlation(echoes: np.ndarray, step_mm: float) -> float:
-    """Return the shift [mm] at which speckle intensity correlates by 1/2, of echoes (n, t) of points at even
-    steps.
+    """Shift [mm] at which speckle intensity correlates by 1/2, of echoes (n, t) of points at even steps.
 
     The correlation is that of the echo with itself (Wagner 1983).
     """
@@ -171,7 +163,7 @@ def half_correlation(echoes: np.ndarray, step_mm: float) -> float:
 
 
 def full_width(place: np.ndarray, amplitude: np.ndarray) -> float:
-    """Return the full width at half maximum of a profile with one peak."""
+    """Full width at half maximum of a profile with one peak."""
     above = np.flatnonzero(amplitude >= 0.5 * amplitude.max())
     half, first, last = 0.5 * amplitude.max(), above[0], above[-1]
     left = np.interp(half, amplitude[first - 1 : first + 1], place[first - 1 : first + 1])

@@ -4,20 +4,18 @@ At rest, with a tracker's errors, and under compression.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 import trimesh
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from tqdm import tqdm
 
-from rehearsal.commands.command_line import CommandError, arch_option, load_patient, make_folder, start_taichi
+from rehearsal.commands.command_line import CommandError, load_patient
 from rehearsal.configuration import PRESETS, Setup, scene_of
 from rehearsal.reconstruction.compression_correction import CompressionCorrection
 from rehearsal.reconstruction.patient_comparison import compare_with_surfaces, surfaces_of
@@ -27,8 +25,8 @@ from scenes.scene import EMBEDDED, Scene, with_options
 from sim.device import start
 from studies.freehand.freehand_sweeps import GroundTruthSweep, pressed, resting, sweep_of
 from studies.harness import rehearsal_of
-from studies.study_options import out_option
-from studies.study_results import finish_axes, text_table, write_results
+from studies.study import CHOSEN, Results, Study, paths_argument, quick_option, study_command
+from studies.tables_and_panels import draw_panel, table_of
 from ultrasound.probe import load_probe
 from ultrasound.reconstruction import METHODS
 from ultrasound.tracking_errors import TrackingErrors, with_tracking_errors
@@ -50,13 +48,15 @@ VARIED: dict[str, tuple[float, ...]] = {
     "latency_s": (0.05, 0.1, 0.2, 0.4),
     "lost": (0.1, 0.25, 0.5, 0.75),
 }
-# The table's columns after sweep, region and scanned part: header and format of each figure of a row.
 COLUMNS = {
-    "dice": ("Dice", ".3f"),
-    "hd95_mm": ("HD95, mm", ".2f"),
-    "volume_percent": ("volume, %", "+.1f"),
-    "centroid_mm": ("centroid, mm", ".2f"),
-    "landmarks_mm": ("landmarks, mm", ".2f"),
+    "sweep": "{name}",
+    "region": "{region}",
+    "scanned, %": "{scanned_percent:.0f}",
+    "Dice": "{dice:.3f}",
+    "HD95, mm": "{hd95_mm:.2f}",
+    "volume, %": "{volume_percent:+.1f}",
+    "centroid, mm": "{centroid_mm:.2f}",
+    "landmarks, mm": "{landmarks_mm:.2f}",
 }
 TRACKING_ERRORS = {
     "noise_mm": "noise of the position, mm",
@@ -74,65 +74,68 @@ COMPRESSION_ERRORS = {
 CORRECTED = "^:"
 
 
-@click.command()
-@click.argument("scenes", type=click.Path(path_type=Path), nargs=-1)
-@out_option
-@click.option("--quick", is_flag=True, help="One size of each error and two depths.")
-@arch_option
-def freehand(scenes: tuple[Path, ...], out: Path, quick: bool, arch: str) -> None:
+@study_command(
+    "freehand",
+    paths_argument("scenes"),
+    quick_option("One size of each error and two depths."),
+    arch=CHOSEN,
+)
+def freehand(study: Study, scenes: tuple[Path, ...], quick: bool) -> Results:
     """Compare volumes of tracked sweeps with the ground truth.
 
     Of SCENES [the embedded patient]: at rest, with a tracker's errors, pressed.
     """
-    make_folder(out)
-    loaded = []
-    for scene in scenes or (EMBEDDED,):
-        one, anatomy = load_patient(scene)
-        if anatomy.ct is None:
-            raise CommandError(f"{scene}: has no CT: expected anatomy.ct, which a sweep shows")
-        loaded.append((one, anatomy))
-    used = start_taichi(arch)
+    loaded = [_with_ct(scene) for scene in scenes or (EMBEDDED,)]
     setup = PRESETS["neo-hookean"]["balanced"]
     runs = []
-    total = sum(count_of(anatomy, quick) for _, anatomy in loaded)
-    with tqdm(total=total, desc="freehand", unit="volume") as bar:
-        for number, (one, anatomy) in enumerate(loaded, 1):
-            figures = measure(one, anatomy, setup, used, quick, bar.update)
-            runs.append(dict(patient=one.title or f"patient {number}") | figures)
+    with study.progress(sum(count_of(anatomy, quick) for _, anatomy in loaded), "volume") as bar:
+        for number, (scene, anatomy) in enumerate(loaded, 1):
+            figures = measure(scene, anatomy, setup, study.backend, quick, bar.update)
+            runs.append(dict(patient=scene.title or f"patient {number}") | figures)
     rows = [row for run in runs for row in rows_of(run)]
-    text = "\n\n".join(map(table, runs))
-    write_results(out, "freehand", dict(arch=used, runs=runs), text, rows, figure_of(runs))
+    report = dict(arch=study.backend, runs=runs)
+    return Results(report, "\n\n".join(map(table, runs)), rows, figure_of(runs))
+
+
+def _with_ct(path: Path) -> tuple[Scene, LoadedAnatomy]:
+    scene, anatomy = load_patient(path)
+    if anatomy.ct is None:
+        raise CommandError(f"{path}: has no CT: expected anatomy.ct, which a sweep shows")
+    return scene, anatomy
 
 
 def measure(
-    scene: Scene,
-    anatomy: LoadedAnatomy,
-    setup: Setup,
-    arch: str,
-    quick: bool,
-    done: Callable[[], Any],
+    scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str, quick: bool, done: Callable[[], Any]
 ) -> dict[str, Any]:
     """All figures of one patient; starts Taichi anew."""
     start(arch)
-    probe = load_probe(PROBE)
-    truth = resting(anatomy, probe, np.array(scene.gravity.direction), PIXELS, scene.image.atlas)
+    truth = resting(anatomy, load_probe(PROBE), np.array(scene.gravity.direction), PIXELS, scene.image.atlas)
     surfaces = surfaces_of(anatomy)
-    rest = []
-    for method in METHODS:
-        rest.append(dict(method=method) | _row(truth, truth.poses, surfaces, method=method))
-        done()
-    curves = noise_curves(truth, surfaces, quick, done)
-    pressed_rows = [] if anatomy.tumour is None else compression(scene, anatomy, setup, arch, quick, done)
+    parts = dict(
+        resting=at_rest(truth, surfaces),
+        noise=noise_curves(truth, surfaces, quick),
+        compression=[] if anatomy.tumour is None else compression(scene, anatomy, setup, arch, quick),
+    )
+    rows: dict[str, list[dict[str, Any]]] = {kind: [] for kind in parts}
+    for kind, of_kind in parts.items():
+        for of_volume in of_kind:
+            rows[kind] += of_volume
+            done()
+    apart_mm = np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1).mean()
     return dict(
         probe=PROBE,
         spacing_mm=SPACING_MM,
         reach_mm=REACH_MM,
         frames=len(truth.poses),
-        apart_mm=round(float(np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1).mean()), 4),
-        resting=rest,
-        noise=curves,
-        compression=pressed_rows,
+        apart_mm=round(float(apart_mm), 4),
+        **rows,
     )
+
+
+def at_rest(truth: GroundTruthSweep, surfaces: dict[str, trimesh.Trimesh]) -> Iterator[list[dict[str, Any]]]:
+    """Figures of the resting sweep by each method."""
+    for method in METHODS:
+        yield [dict(method=method) | _row(truth, truth.poses, surfaces, method=method)]
 
 
 def count_of(anatomy: LoadedAnatomy, quick: bool) -> int:
@@ -150,29 +153,22 @@ def _depths(quick: bool) -> tuple[float, ...]:
 
 
 def noise_curves(
-    truth: GroundTruthSweep, surfaces: dict[str, trimesh.Trimesh], quick: bool, done: Callable[[], Any]
-) -> list[dict[str, Any]]:
+    truth: GroundTruthSweep, surfaces: dict[str, trimesh.Trimesh], quick: bool
+) -> Iterator[list[dict[str, Any]]]:
     """Figures of the resting sweep for trackers with one error each."""
-    times = truth.sweep.times_s[::EVERY]
+    poses, times = truth.poses[::EVERY], truth.sweep.times_s[::EVERY]
     few = replace(
-        truth,
-        sweep=sweep_of(truth.sweep.images[::EVERY], truth.poses[::EVERY], times, truth.on_probe),
-        poses=truth.poses[::EVERY],
+        truth, sweep=sweep_of(truth.sweep.images[::EVERY], poses, times, truth.on_probe), poses=poses
     )
-    trials = [TrackingErrors()] + [
-        TrackingErrors(**{name: size}) for name, sizes in VARIED.items() for size in _sizes(sizes, quick)
-    ]
-    rows = []
-    for errors in trials:
-        poses = with_tracking_errors(few.poses, few.sweep.times_s, errors, SEED)
-        rows.append(asdict(errors) | _row(few, poses, surfaces))
-        done()
-    return rows
+    sizes = [(name, size) for name, values in VARIED.items() for size in _sizes(values, quick)]
+    for errors in [TrackingErrors(), *(TrackingErrors(**{name: size}) for name, size in sizes)]:
+        tracked = with_tracking_errors(poses, times, errors, SEED)
+        yield [asdict(errors) | _row(few, tracked, surfaces)]
 
 
 def compression(
-    scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str, quick: bool, done: Callable[[], Any]
-) -> list[dict[str, Any]]:
+    scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str, quick: bool
+) -> Iterator[list[dict[str, Any]]]:
     """Figures of sweeps pressed over the tumour at some depths, without and with compression correction."""
     start(arch)
     small = with_options(scene_of(scene, setup), {"image.pixels": PIXELS})
@@ -180,17 +176,16 @@ def compression(
     fixed = scene.attachment.model_copy(update={"radius_mm": radius_mm, "stiffness_n_mm": 0.0})
     rehearsal = rehearsal_of(small.model_copy(update={"attachment": fixed}), anatomy)
     surfaces = surfaces_of(anatomy)
-    rows = []
     for depth in _depths(quick):
         truth = pressed(rehearsal, depth)
         rehearsal.reset()
         track = image_poses_of(truth.sweep, REFERENCE)
         correction = CompressionCorrection(rehearsal, truth.sweep, track, REFERENCE)
-        for undone, places in ((False, None), (True, correction)):
-            row = dict(depth_mm=depth, compression_mm=round(truth.compression_mm, 4), undone=undone)
-            rows.append(row | _row(truth, truth.poses, surfaces, places))
-        done()
-    return rows
+        press = dict(depth_mm=depth, compression_mm=round(truth.compression_mm, 4))
+        yield [
+            press | dict(undone=undone) | _row(truth, truth.poses, surfaces, places)
+            for undone, places in ((False, None), (True, correction))
+        ]
 
 
 def _row(
@@ -215,13 +210,10 @@ def rows_of(run: dict[str, Any]) -> list[dict[str, Any]]:
         for row in run[kind]:
             settings = {name: value for name, value in row.items() if not isinstance(value, dict)}
             for region in ("organ", "tumour"):
-                part = row.get(region, {}).get("scanned_part")
-                if not part:
-                    continue
-                place = dict(
-                    patient=run["patient"], sweep=kind, region=region, scanned=row[region]["scanned"]
-                )
-                rows.append(place | part | dict(landmarks_mm=row["landmarks"]["mean_mm"]) | settings)
+                if part := row.get(region, {}).get("scanned_part"):
+                    place = dict(patient=run["patient"], sweep=kind, region=region)
+                    figures = dict(scanned=row[region]["scanned"]) | part
+                    rows.append(place | figures | dict(landmarks_mm=row["landmarks"]["mean_mm"]) | settings)
     return rows
 
 
@@ -231,13 +223,8 @@ def table(run: dict[str, Any]) -> str:
         f"{run['patient']}: {run['probe']} probe, {run['frames']} images {run['apart_mm']:.2f} mm apart, "
         f"voxels of {run['spacing_mm']:g} mm"
     )
-    headers, formats = zip(*COLUMNS.values(), strict=True)
-    rows = [
-        [_named(row), row["region"], 100 * row["scanned"], *(row[name] for name in COLUMNS)]
-        for row in rows_of(run)
-    ]
-    figures = text_table(["sweep", "region", "scanned, %", *headers], rows, ["", "", ".0f", *formats])
-    return f"{head}\n{figures}"
+    rows = [row | dict(name=_named(row), scanned_percent=100 * row["scanned"]) for row in rows_of(run)]
+    return f"{head}\n{table_of(COLUMNS, rows)}"
 
 
 def _named(row: dict[str, Any]) -> str:
@@ -277,32 +264,40 @@ def _legend(axes: Axes, styles: dict[str, str]) -> None:
 
 def _against_noise(axes: Axes, runs: list[dict[str, Any]], name: str, label: str) -> None:
     """Landmark error of the resting sweep, and the distance of the tumour's centroid."""
+    others = [error for error in TRACKING_ERRORS if error != name]
     for number, run in enumerate(runs):
-        rows = [row for row in run["noise"] if row[name] or not any(row[other] for other in TRACKING_ERRORS)]
-        at = [row[name] for row in rows]
-        colour = f"C{number}"
-        axes.plot(at, [row["landmarks"]["mean_mm"] for row in rows], "o-", color=colour)
+        rows = [row for row in run["noise"] if not any(row[error] for error in others)]
+        _curve(axes, rows, name, "landmarks", "o-", number)
         if "tumour" in rows[0]:
-            tumour = [(row["tumour"]["scanned_part"] or {}).get("centroid_mm", math.nan) for row in rows]
-            axes.plot(at, tumour, "s--", color=colour)
+            _curve(axes, rows, name, "centroid_mm", "s--", number)
     _finish(axes, label, "mm")
 
 
 def _against_compression(axes: Axes, runs: list[dict[str, Any]], name: str) -> None:
     for number, run in enumerate(runs):
+        # A press may move the tumour out of the images.
+        known = [row for row in run["compression"] if row["landmarks"]["count"] and _tumour(row)]
         for undone, style in ((False, "o-"), (True, CORRECTED)):
-            depths, values = [], []
-            for row in run["compression"]:
-                tumour = row.get("tumour", {}).get("scanned_part")
-                # A press may move the tumour out of the images.
-                if row["undone"] == undone and tumour and row["landmarks"]["count"]:
-                    depths.append(row["depth_mm"])
-                    values.append(row["landmarks"]["mean_mm"] if name == "landmarks" else tumour[name])
-            axes.plot(depths, values, style, color=f"C{number}")
+            rows = [row for row in known if row["undone"] == undone]
+            _curve(axes, rows, "depth_mm", name, style, number)
     _finish(axes, "depth of the press, mm", COMPRESSION_ERRORS[name])
 
 
+def _curve(axes: Axes, rows: list[dict[str, Any]], x: str, name: str, style: str, number: int) -> None:
+    """A figure of a patient's tumour, or of its landmarks, against one of the settings."""
+    values = [
+        row["landmarks"]["mean_mm"] if name == "landmarks" else _tumour(row).get(name, math.nan)
+        for row in rows
+    ]
+    axes.plot([row[x] for row in rows], values, style, color=f"C{number}")
+
+
+def _tumour(row: dict[str, Any]) -> dict[str, float]:
+    """The figures of the part of the tumour that was scanned; empty where there is none."""
+    return row.get("tumour", {}).get("scanned_part") or {}
+
+
 def _finish(axes: Axes, x_label: str, y_label: str) -> None:
-    finish_axes(axes, xlabel=x_label, ylabel=y_label)
+    draw_panel(axes, xlabel=x_label, ylabel=y_label)
     # A value near zero stays visible above the frame.
     axes.set_ylim(bottom=-0.04 * axes.get_ylim()[1])

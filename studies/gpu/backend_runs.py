@@ -37,8 +37,8 @@ def run_backend(
     run, names = BackendRun(backend), list(cases_of(backend))
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
-    given = theirs, backend, tries_refused, cases_of, os.getpid()
-    child = context.Process(target=_measure, args=given, daemon=True)
+    arguments = theirs, backend, tries_refused, cases_of, os.getpid()
+    child = context.Process(target=_measure, args=arguments, daemon=True)
     end_s = monotonic() + seconds
     child.start()
     theirs.close()
@@ -68,9 +68,7 @@ def run_backend(
 def _measure(
     connection: Connection, backend: str, tries_refused: bool, cases_of: CasesOf, parent: int
 ) -> None:
-    """In the process: send ("measured", CaseFigures) for each, ("ended", fault or "") after each case, or
-    ("refused", why).
-    """
+    """In the process: send ("measured", CaseFigures), ("ended", fault or "") of a case, ("refused", why)."""
     end_with_parent(parent)
     try:
         start(backend, accepts_wrong_results=tries_refused)

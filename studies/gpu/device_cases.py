@@ -14,6 +14,7 @@ from rehearsal.result_files import spread
 from rehearsal.stopwatch import timed
 from scenes.scene import EMBEDDED
 from studies.accuracy.bead_case import load_case
+from studies.harness import step_of
 from studies.performance.step_timing import COUNTS, PAPERS, STEPS, blocks
 from studies.performance.tradeoff import EMBEDDED_CASE
 
@@ -76,24 +77,11 @@ def press(name: str, setup: Setup) -> Iterator[CaseFigures]:
     experiment = BeadExperiment(load_case(EMBEDDED_CASE), short)
     run = experiment.run(short)
     first_s = perf_counter() - start_s - sum(run.step_ms) / 1000
-    figures = dict(nodes=experiment.model.counts()["particles"], **_step_of(setup))
+    nodes = experiment.model.counts()["particles"]
     arrays = dict(beads_mm=run.beads, force_n=run.force_n)
-    yield CaseFigures(
-        name, first_s, spread(run.step_ms), figures, {k: v for k, v in arrays.items() if _is_known(v)}
-    )
-
-
-def _step_of(setup: Setup) -> dict[str, Any]:
-    return dict(
-        size_mm=setup.size_mm,
-        substeps=setup.substeps,
-        iterations=setup.iterations,
-        time_step_s=setup.solver.time_step_s,
-    )
-
-
-def _is_known(values: np.ndarray) -> bool:
-    return bool(np.isfinite(values).all())
+    known = {kind: values for kind, values in arrays.items() if np.isfinite(values).all()}
+    figures = dict(nodes=nodes, size_mm=setup.size_mm) | step_of(setup)
+    yield CaseFigures(name, first_s, spread(run.step_ms), figures, known)
 
 
 def pictures() -> Iterator[CaseFigures]:

@@ -3,7 +3,6 @@
 import os
 import platform
 from collections.abc import Iterator
-from pathlib import Path
 from time import monotonic
 from typing import Any
 
@@ -11,12 +10,11 @@ import click
 import numpy as np
 from tqdm import tqdm
 
-from rehearsal.commands.command_line import make_folder
 from render.vulkan_device import vulkan_devices
 from studies.gpu.backend_runs import BackendRun, run_backend
 from studies.gpu.device_cases import MOST_MS, CaseFigures, cases
-from studies.study_options import number_option, out_option
-from studies.study_results import table_of, write_results
+from studies.study import Results, Study, number_option, study_command
+from studies.tables_and_panels import table_of
 from version import VERSION
 
 BACKENDS = ("cpu", "cuda", "vulkan")
@@ -38,19 +36,20 @@ COLUMNS = {
 }
 
 
-@click.command()
-@out_option
-@number_option("--seconds", low=10, high=3600, default=480, help="How long it may take.")
-@click.option("--try-refused", is_flag=True, help="Measure a driver whose results are refused, too.")
-def gpu(out: Path, seconds: float, try_refused: bool) -> None:
+@study_command(
+    "gpu",
+    number_option("--seconds", low=10, high=3600, default=480, help="How long it may take."),
+    click.option("--try-refused", is_flag=True, help="Measure a driver whose results are refused, too."),
+)
+def gpu(study: Study, seconds: float, try_refused: bool) -> Results:
     """Measure step, picture and frame on each graphics card.
 
     CUDA and Vulkan, compared with the processor.
     """
-    make_folder(out)
-    runs = list(_runs(seconds, try_refused))
-    reference = {each.case: each for each in runs[0].measured}
-    rows = [row(run.backend, each, reference) for run in runs for each in run.measured]
+    with study.progress(sum(len(cases(backend)) for backend in BACKENDS), "case") as bar:
+        runs = list(_runs(seconds, try_refused, bar))
+    reference = {figures.case: figures for figures in runs[0].measured}
+    rows = [row(run.backend, figures, reference) for run in runs for figures in run.measured]
     missing = [
         dict(backend=run.backend, cases=[case for case, of in run.missing.items() if of == why], why=why)
         for run in runs
@@ -65,22 +64,21 @@ def gpu(out: Path, seconds: float, try_refused: bool) -> None:
         not_measured=missing,
         faults=faults(rows),
     )
-    write_results(out, "gpu", report, text_of(report))
+    return Results(report, text_of(report))
 
 
-def _runs(seconds: float, try_refused: bool) -> Iterator[BackendRun]:
+def _runs(seconds: float, try_refused: bool, bar: tqdm) -> Iterator[BackendRun]:
     end_s = monotonic() + seconds
-    with tqdm(total=sum(len(cases(backend)) for backend in BACKENDS), desc="gpu", unit="case") as bar:
-        for number, backend in enumerate(BACKENDS):
-            left = end_s - monotonic()
-            share = CPU_SHARE if backend == "cpu" else 1 / (len(BACKENDS) - number)
-            before = bar.n
-            run = BackendRun(backend)
-            for run in run_backend(backend, share * left, try_refused):
-                bar.set_postfix_str(backend)
-                bar.n = before + run.ended
-                bar.refresh()
-            yield run
+    for number, backend in enumerate(BACKENDS):
+        left = end_s - monotonic()
+        share = CPU_SHARE if backend == "cpu" else 1 / (len(BACKENDS) - number)
+        before = bar.n
+        run = BackendRun(backend)
+        for run in run_backend(backend, share * left, try_refused):
+            bar.set_postfix_str(backend)
+            bar.n = before + run.ended
+            bar.refresh()
+        yield run
 
 
 def row(backend: str, measured: CaseFigures, reference: dict[str, CaseFigures]) -> dict[str, Any]:
@@ -104,14 +102,14 @@ def row(backend: str, measured: CaseFigures, reference: dict[str, CaseFigures]) 
     )
 
 
-def differences(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> dict[str, float]:
+def differences(results: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> dict[str, float]:
     """Largest distance of a bead [mm]; of a force, in % of the largest; of a grey level, and how many
     pixels [%] differ by more than one level.
     """
     apart = {}
-    for name in found.keys() & expected.keys():
+    for name in results.keys() & expected.keys():
         # Grey levels are unsigned.
-        difference = found[name].astype(float) - expected[name].astype(float)
+        difference = results[name].astype(float) - expected[name].astype(float)
         if name == "beads_mm":
             apart["beads_apart_mm"] = np.linalg.norm(difference, axis=-1).max()
         elif name == "force_n":
@@ -125,32 +123,29 @@ def differences(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -
 
 def faults(rows: list[dict[str, Any]]) -> list[str]:
     """What is slower, or farther from the processor's result, than is asked."""
-    found = []
-    for each in rows:
-        where = f"{each['backend']}, {each['case']}"
-        if each["most_ms"] is not None and each["median_ms"] > each["most_ms"]:
-            found.append(f"{where}: {each['median_ms']:.2f} ms; asked: at most {each['most_ms']:g} ms")
+    lines = []
+    for row in rows:
+        where = f"{row['backend']}, {row['case']}"
+        if row["most_ms"] is not None and row["median_ms"] > row["most_ms"]:
+            lines.append(f"{where}: {row['median_ms']:.2f} ms; asked: at most {row['most_ms']:g} ms")
         for name, most in MOST_APART.items():
-            if each[name] is not None and each[name] > most:
+            if row[name] is not None and row[name] > most:
                 unit = "mm" if name.endswith("mm") else "grey levels"
-                found.append(f"{where}: {each[name]:g} {unit} from the processor's; asked: at most {most:g}")
-    return found
+                lines.append(f"{where}: {row[name]:g} {unit} from the processor's; asked: at most {most:g}")
+    return lines
 
 
 def text_of(report: dict[str, Any]) -> str:
     """The table, what was not measured, and what is not as asked."""
     devices = ", ".join(report["vulkan_devices"]) or "none"
+    head = f"{report['cores']} cores; Vulkan devices: {devices}"
     lines = [
-        f"{report['cores']} cores; Vulkan devices: {devices}. Differences are from the processor's "
-        "results.\n",
-        table_of(COLUMNS.items(), report["rows"]),
+        f"{head}. Differences are from the processor's results.\n",
+        table_of(COLUMNS, report["rows"]),
     ]
     if report["not_measured"]:
         lines.append("\nNot measured:")
-        lines += [
-            f"  {each['backend']}, {', '.join(each['cases'])}: {each['why']}"
-            for each in report["not_measured"]
-        ]
+        lines += [f"  {m['backend']}, {', '.join(m['cases'])}: {m['why']}" for m in report["not_measured"]]
     if report["faults"]:
         lines += ["\nNot as asked:", *(f"  {fault}" for fault in report["faults"])]
     return "\n".join(lines)

@@ -2,7 +2,7 @@
 and the B-mode image.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +12,9 @@ from PIL import Image
 
 from scenes.atomic_files import atomic_write
 from studies.patient_images.patient_image_scans import ImagedPatient, PlaneScan
-from studies.patient_images.picture_truth import pixel_places
+from studies.patient_images.patient_truth import pixel_places
+from ultrasound.acoustics import TissueVoxels
+from ultrasound.scanned_anatomy import ScannedAnatomy
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -64,9 +66,7 @@ def write_sheet(patient: ImagedPatient, scans: Sequence[PlaneScan], title: str, 
 
 
 def sheet_figure(patient: ImagedPatient, scans: Sequence[PlaneScan], title: str) -> "Figure":
-    """Return the sheet as a figure: a column for each plane; rows for CT, labels, classes and B-mode
-    image.
-    """
+    """The sheet as a figure: a column for each plane; rows for CT, labels, classes and B-mode image."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
@@ -79,12 +79,12 @@ def sheet_figure(patient: ImagedPatient, scans: Sequence[PlaneScan], title: str)
     figure.subplots_adjust(0, LEGEND_PIXELS / size[1], 1, 1 - TITLE_PIXELS / size[1], 0.02, 0.02)
     shown: set[str] = set()
     for scan, column_axes in zip(scans, axes.T, strict=True):
-        classes = classes_of(patient, scan)
+        # What is labelled, and all that is classified besides.
+        labels, classes = (_names_at(voxels, scan) for voxels in (patient.anatomy, patient.anatomy.voxels))
         shown |= set(np.unique(classes))
-        for image, each in zip((scan.ct, scan.ct, coloured(classes), scan.b_mode), column_axes, strict=True):
-            each.imshow(image, cmap="gray", vmin=0, vmax=255, aspect="auto", interpolation="bilinear")
-            each.axis("off")
-        labels = labels_of(patient, scan)
+        for image, panel in zip((scan.ct, scan.ct, coloured(classes), scan.b_mode), column_axes, strict=True):
+            panel.imshow(image, cmap="gray", vmin=0, vmax=255, aspect="auto", interpolation="bilinear")
+            panel.axis("off")
         for name in set(np.unique(labels)) - {""}:
             column_axes[1].contour(labels == name, [0.5], colors=[_hex(name)], linewidths=1)
         column_axes[0].set_title(scan.name, fontsize=10)
@@ -94,22 +94,8 @@ def sheet_figure(patient: ImagedPatient, scans: Sequence[PlaneScan], title: str)
     return figure
 
 
-def classes_of(patient: ImagedPatient, scan: PlaneScan) -> np.ndarray:
-    """Return the names of the classes (rows, columns) at a scan's pixels, "" where there is none."""
-    voxels = patient.voxels
-    return _names_at(voxels.labels, voxels.tissues, voxels.index_from_mm, scan)
-
-
-def labels_of(patient: ImagedPatient, scan: PlaneScan) -> np.ndarray:
-    """Return the names of the labels (rows, columns) at a scan's pixels, before what is not labelled is
-    classified.
-    """
-    anatomy = patient.anatomy
-    return _names_at(anatomy.labels, anatomy.tissues, anatomy.index_from_mm, scan)
-
-
 def coloured(names: np.ndarray) -> np.ndarray:
-    """Return the colours (rows, columns, 3) uint8 of the names of tissues (rows, columns)."""
+    """Colours (rows, columns, 3) uint8 of the names of tissues (rows, columns)."""
     known, index = np.unique(names, return_inverse=True)
     return np.array([COLOURS.get(name, UNCLASSIFIED) for name in known], np.uint8)[index.reshape(names.shape)]
 
@@ -119,7 +105,7 @@ def _hex(name: str) -> str:
 
 
 def _palette() -> Image.Image:
-    """Return an image with the palette of a sheet: grey values, and the colours of the classes."""
+    """An image with the palette of a sheet: grey values, and the colours of the classes."""
     greys = np.linspace(0, 255, GREY_VALUES).round().astype(int)
     palette = Image.new("P", (1, 1))
     palette.putpalette(
@@ -128,15 +114,14 @@ def _palette() -> Image.Image:
     return palette
 
 
-def _names_at(
-    labels: np.ndarray | None, tissues: Mapping[int, str], index_from_mm: np.ndarray, scan: PlaneScan
-) -> np.ndarray:
-    """Return the tissues (rows, columns) of the voxels that the pixels of a scan are in."""
+def _names_at(voxels: TissueVoxels | ScannedAnatomy, scan: PlaneScan) -> np.ndarray:
+    """Tissues (rows, columns) of the voxels that the pixels of a scan are in, "" where there is none."""
     world = pixel_places(scan.probe, scan.b_mode.shape) @ scan.pose[:3, :2].T + scan.pose[:3, 3]
-    at = np.rint(world @ index_from_mm[:3, :3].T + index_from_mm[:3, 3]).astype(int)
+    from_mm, labels = voxels.index_from_mm, voxels.labels
     assert labels is not None
+    at = np.rint(world @ from_mm[:3, :3].T + from_mm[:3, 3]).astype(int)
     inside = ((at >= 0) & (at < labels.shape)).all(axis=-1)
     values = np.zeros(inside.shape, int)
     values[inside] = labels[tuple(at[inside].T)]
     known, index = np.unique(values, return_inverse=True)
-    return np.array([tissues.get(int(value), "") for value in known])[index.reshape(values.shape)]
+    return np.array([voxels.tissues.get(int(value), "") for value in known])[index.reshape(values.shape)]

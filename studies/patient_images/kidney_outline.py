@@ -54,15 +54,15 @@ def outlined_kidney(
     directions = np.sin(_angles())[:, None], np.cos(_angles())[:, None]
     places = [at + radius * to / mm for at, to, mm in zip(centre, directions, pixel_mm, strict=True)]
     level, reached = (
-        ndimage.map_coordinates(each.astype(float), places, order=1) for each in (level, covered)
+        ndimage.map_coordinates(values.astype(float), places, order=1) for values in (level, covered)
     )
     outline = _closed_path(_step_cost(level, reached > 0.5)[:, LEAST_MM : MOST_MM + 1]) + LEAST_MM
     return covered & (away <= np.interp(angle, _angles(), outline, period=2 * np.pi))
 
 
 def outline_by_place(covered: np.ndarray, centre: Sequence[float], pixel_mm: Sequence[float]) -> np.ndarray:
-    """Return an outline (rows, columns) that sees no image: an ellipse about the kidney's centre that
-    touches the array.
+    """An outline (rows, columns) that sees no image: an ellipse about the kidney's centre that touches the
+    array.
     """
     row, column = np.indices(covered.shape)
     height = (centre[0] + 0.5) * pixel_mm[0]
@@ -75,8 +75,8 @@ def _angles() -> np.ndarray:
 
 
 def _step_cost(level: np.ndarray, reached: np.ndarray) -> np.ndarray:
-    """Return the cost of a step of the outline by direction and radius [mm], of the logarithm of grey
-    values and of where they are known.
+    """Cost of a step of the outline by direction and radius [mm], of the logarithm of grey values and of
+    where they are known.
     """
 
     def layers(values: np.ndarray) -> np.ndarray:
@@ -86,16 +86,16 @@ def _step_cost(level: np.ndarray, reached: np.ndarray) -> np.ndarray:
     known = layers(reached.astype(float))
     mean = layers(np.where(reached, level, 0.0)) / np.maximum(known, 1e-6)
     (within, beyond), (known_within, known_beyond) = (
-        (np.roll(each, LAYER_MM // 2, axis=1), np.roll(each, -LAYER_MM // 2, axis=1))
-        for each in (mean, known)
+        (np.roll(layer, LAYER_MM // 2, axis=1), np.roll(layer, -LAYER_MM // 2, axis=1))
+        for layer in (mean, known)
     )
     cost = np.exp(-np.maximum(beyond - within, 0.0) / np.log(CONTRAST))
     return np.where(np.minimum(known_within, known_beyond) > 0.5, cost, UNKNOWN_COST)
 
 
 def _closed_path(cost: np.ndarray) -> np.ndarray:
-    """Return the radius (angles,), as an index, of a cheap path through a cost (angles, radii) that begins
-    and ends at the cheapest step.
+    """Radius (angles,), as an index, of a cheap path through a cost (angles, radii) that begins and ends at
+    the cheapest step.
     """
     first, start = np.unravel_index(cost.argmin(), cost.shape)
     turn = np.roll(cost, -first, axis=0)
@@ -106,20 +106,20 @@ def _closed_path(cost: np.ndarray) -> np.ndarray:
 
 
 def kidney_contour(kidney: np.ndarray, pixel_mm: Sequence[float]) -> np.ndarray:
-    """Return a mask of parenchyma (rows, columns) with the sinus, which labels of parenchyma may leave
-    out: hollows of SINUS_MM and holes.
+    """A mask of parenchyma (rows, columns) with the sinus, which labels of parenchyma may leave out: hollows
+    of SINUS_MM and holes.
     """
     return ndimage.binary_fill_holes(closed(kidney, SINUS_MM, pixel_mm))
 
 
 def dice(one: np.ndarray, other: np.ndarray) -> float:
-    """Return the Dice coefficient of two masks; NaN where both are empty."""
+    """Dice coefficient of two masks; NaN where both are empty."""
     total = int(one.sum()) + int(other.sum())
     return 2 * int((one & other).sum()) / total if total else float("nan")
 
 
 def closed(mask: np.ndarray, radius_mm: float, pixel_mm: Sequence[float]) -> np.ndarray:
-    """Return a mask (rows, columns) closed by a disc; beyond the border it goes on as at the border."""
+    """A mask (rows, columns) closed by a disc; beyond the border it goes on as at the border."""
     margin = [int(np.ceil(2 * radius_mm / mm)) for mm in pixel_mm]
     wide = np.pad(mask, [(n, n) for n in margin], mode="edge")
     core = _distance(~wide, pixel_mm) > radius_mm
@@ -128,9 +128,7 @@ def closed(mask: np.ndarray, radius_mm: float, pixel_mm: Sequence[float]) -> np.
 
 
 def _distance(mask: np.ndarray, pixel_mm: Sequence[float]) -> np.ndarray:
-    """Return the distance [mm] of each pixel of a mask from the nearest outside it, infinite where there
-    is none.
-    """
+    """Distance [mm] of each pixel of a mask from the nearest outside it, infinite where there is none."""
     if mask.all():
         return np.full(mask.shape, np.inf)
     return ndimage.distance_transform_edt(mask, sampling=pixel_mm)

@@ -1,25 +1,85 @@
 """Images of a patient's standard planes with a probe, each with its truth."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import trimesh
 from scipy import ndimage
 
 from rehearsal.deformed_anatomy import scanned_anatomy
 from scenes.anatomy import LoadedAnatomy
+from scenes.kidney_axes import KidneyAxes, kidney_axes
 from scenes.scene import Scene
 from sim.embedding import Unmoved
-from studies.patient_images.patient_truth import PatientTruth
-from studies.patient_images.picture_truth import PictureTruth, picture_truth
-from studies.patient_images.scanline_truth import ScanlineTruth, scanline_truth
-from studies.patient_images.standard_planes import standard_planes
-from ultrasound.acoustics import TissueVoxels
+from studies.patient_images.patient_truth import (
+    PatientTruth,
+    PictureTruth,
+    ScanlineTruth,
+    picture_truth,
+    scanline_truth,
+)
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import ImagePlane
 from ultrasound.scanned_anatomy import ScannedAnatomy
 from ultrasound.scanner import B_MODE, CT, Scanner
+
+# Where no hilum is known, the front is towards the patient's.
+ANTERIOR = np.array([0.0, -1.0, 0.0])
+# Width of the band of surface that the array's face rests on, across the image plane [mm].
+BAND_MM = 4.0
+
+
+def standard_planes(
+    organ: trimesh.Trimesh, hilum_mm: Sequence[float] | None, probe: Probe
+) -> dict[str, np.ndarray]:
+    """Poses (4, 4) by name, PLUS's axes of a probe to patient (LPS, mm); the face touches the organ at rest.
+
+    Front and back are those of the kidney itself, across its polar axis and its hilum; the side is opposite
+    the hilum. Where no hilum is known, which of the two sides it is is not known either, and the plane of the
+    hilum passes through the centre.
+    """
+    axes = kidney_axes(organ, [], {}, hilum_mm)
+    polar, hilar, front = _directions(axes)
+    hilum = axes.centre if hilum_mm is None else np.asarray(hilum_mm, float)
+    aslant = (front + hilar) / np.sqrt(2)
+    beams = {
+        "front, long axis": (-front, polar, axes.centre),
+        "front, short axis": (-front, hilar, axes.centre),
+        "side, long axis": (hilar, polar, axes.centre),
+        "side, short axis": (hilar, front, axes.centre),
+        "back, long axis": (front, polar, axes.centre),
+        "back, short axis": (front, hilar, axes.centre),
+        "hilum": (-aslant, polar, hilum),
+        "lower pole": (polar, hilar, axes.centre),
+    }
+    return {name: _touching(organ, probe, *beam) for name, beam in beams.items()}
+
+
+def _directions(axes: KidneyAxes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit vectors (3,) to the upper pole, to the hilum and to the front."""
+    if axes.hilar is not None and axes.anterior is not None:
+        return axes.polar, axes.hilar, axes.anterior
+    front = ANTERIOR - (ANTERIOR @ axes.polar) * axes.polar
+    front /= np.linalg.norm(front)
+    return axes.polar, np.cross(axes.polar, front), front
+
+
+def _touching(
+    organ: trimesh.Trimesh, probe: Probe, beam: np.ndarray, lateral: np.ndarray, through: np.ndarray
+) -> np.ndarray:
+    """Pose (4, 4) whose face touches the organ and whose central scanline meets a point (3,)."""
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([lateral, beam, np.cross(lateral, beam)])
+    surface = (np.concatenate([organ.vertices, organ.triangles_center]) - through) @ pose[:3, :3]
+    near = (np.abs(surface[:, 0]) <= probe.array_width_mm / 2) & (np.abs(surface[:, 2]) <= BAND_MM / 2)
+    # A curved face bulges towards the tissue at its middle.
+    radius = probe.radius_mm
+    behind = radius - np.sqrt(np.maximum(radius**2 - surface[near, 0] ** 2, 0.0))
+    pose[:3, 3] = through + (surface[near, 1] + behind).min() * beam
+    return pose
+
 
 PIXELS = 512
 # Side of the square over which speckle is averaged.
@@ -66,15 +126,10 @@ class ImagedPatient:
 
     @classmethod
     def of(cls, scene: Scene, anatomy: LoadedAnatomy) -> "ImagedPatient":
-        """Return a patient with a CT whose kidney is labelled."""
+        """A patient with a CT whose kidney is labelled."""
         assert anatomy.ct is not None
         scanned = scanned_anatomy(anatomy.organ, anatomy.ct, anatomy, np.zeros(3), scene.image.atlas)
         return cls(scene, scanned, PatientTruth.of(scanned))
-
-    @property
-    def voxels(self) -> TissueVoxels:
-        """The tissue of each voxel, as classified."""
-        return self.anatomy.voxels
 
     def scans(self, probe: Probe) -> Iterator[PlaneScan]:
         """Yield the scans of the standard planes, at rest, with default settings."""

@@ -2,19 +2,15 @@
 
 from collections.abc import Callable, Iterator
 from functools import cache, partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
-import click
 import numpy as np
 import taichi as ti
 import trimesh
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from rehearsal.build_solver import build_solver, embedding_cell_mm, static_shape
 from rehearsal.case import case_of
-from rehearsal.commands.command_line import arch_option
 from rehearsal.configuration import PRESETS, Setup, scene_of
 from rehearsal.deformed_anatomy import SURROUNDINGS_MM
 from rehearsal.imaging import image_view
@@ -41,8 +37,8 @@ from sim.skinning import Skin
 from sim.solver import Solver
 from sim.taichi_internals import launched_kernels
 from studies.harness import memory_mb, rehearsal_of
-from studies.study_options import open_study, out_option, scene_argument
-from studies.study_results import finish_axes, table_of, write_results
+from studies.study import CHOSEN, Results, Study, quick_option, study_command
+from studies.tables_and_panels import draw_panel, table_of
 from ultrasound.persistence import Persistence
 from ultrasound.probe import DetailLevel, DopplerMode, Mode, Probe
 from ultrasound.probe_manipulator import ImagePlane, advanced, pose_at, poses_between, touching
@@ -113,34 +109,31 @@ FEATURES = {
 PART_MM, TERM = 10.0, (0.5, 1.0)
 
 
-@click.command()
-@scene_argument(PAPER)
-@out_option
-@click.option(
-    "--quick",
-    is_flag=True,
-    help="Neo-Hookean alone, coarse, no kernels counted: in less than a minute.",
+@study_command(
+    "features",
+    quick_option("Neo-Hookean alone, coarse, no kernels counted: in less than a minute."),
+    scene=PAPER,
+    arch=CHOSEN,
 )
-@arch_option
-def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
+def features(study: Study, quick: bool) -> Results:
     """Measure what each feature of SCENE costs.
 
     In time, memory and kernels: the same press with it and without, in turn.
     """
-    loaded, anatomy, used = open_study(out, scene, arch)
     models = [USUAL] if quick else list(FEATURES)
-    rows: list[dict[str, Any]] = []
     total = sum(len(FEATURES[model]) for model in models) + 1
-    with tqdm(total=total, desc="features", unit="feature") as bar:
-        for model in models:
-            body = FeatureBody(loaded, anatomy, PRESETS[model]["fast" if quick else "balanced"], used)
-            for row in of_steps(body, FEATURES[model], used, quick):
-                rows.append(dict(model=model) | row)
-                bar.update()
-        rows += [dict(model=FRAME) | row for row in of_frame(loaded, anatomy, used)]
-        bar.update()
-    rows = [{name: row[name] for name in NAMES} for row in rows]
-    write_results(out, "features", dict(arch=used, features=rows), table(rows), rows, figure_of(rows))
+    measured = study.progress(total, "feature", _measured(study, models, quick))
+    rows = [{name: row[name] for name in NAMES} for part in measured for row in part]
+    return Results(dict(arch=study.backend, features=rows), table(rows), rows, figure_of(rows))
+
+
+def _measured(study: Study, models: list[str], quick: bool) -> Iterator[list[dict[str, Any]]]:
+    """The row of each feature, then those of a frame."""
+    for model in models:
+        body = FeatureBody(*study.scene, PRESETS[model]["fast" if quick else "balanced"], study.backend)
+        for row in of_steps(body, FEATURES[model], study.backend, quick):
+            yield [dict(model=model) | row]
+    yield [dict(model=FRAME) | row for row in of_frame(*study.scene, study.backend)]
 
 
 class FeatureBody:
@@ -211,7 +204,7 @@ def of_steps(
     for name, both in features.items():
         row: dict[str, Any] = dict(feature=name)
         for state, options, figures in zip(("on", "off"), both, _stepped(body, both, arch), strict=True):
-            row |= {f"{each}_{state}": value for each, value in (figures | counted(options)).items()}
+            row |= {f"{figure}_{state}": value for figure, value in (figures | counted(options)).items()}
         yield row
 
 
@@ -345,17 +338,16 @@ def _added(row: dict[str, Any], name: str) -> float | None:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """What each feature adds: time of a step or part of a frame, memory, parallel kernels and launches."""
-    return table_of(COLUMNS.items(), [row | {name: _added(row, name) for name in MEASURED} for row in rows])
+    return table_of(COLUMNS, [row | {name: _added(row, name) for name in MEASURED} for row in rows])
 
 
 def figure_of(rows: list[dict[str, Any]]) -> Figure:
     """What features add to a step, and below it what the parts of a frame take."""
-    titles = (
-        "A time step: with each feature, less without it",
-        "A frame: each part, and all that it needs, by itself",
-    )
     parts = {
-        title: [row for row in rows if (row["model"] == FRAME) == (title == titles[1])] for title in titles
+        "A time step: with each feature, less without it": [row for row in rows if row["model"] != FRAME],
+        "A frame: each part, and all that it needs, by itself": [
+            row for row in rows if row["model"] == FRAME
+        ],
     }
     figure = Figure(figsize=(12, 0.34 * len(rows) + 3), layout="constrained")
     heights = [len(part) + 3 for part in parts.values()]
@@ -379,6 +371,6 @@ def _bars(panels: Any, rows: list[dict[str, Any]]) -> None:
             axes.annotate(f" {value:.2f}", (max(value, 0.0), y), va="center", fontsize=8)
         axes.axvline(0.0, color="0.4", linewidth=0.8)
         axes.margins(x=0.12)
-        finish_axes(axes, grid="x", xlabel=unit)
+        draw_panel(axes, grid="x", xlabel=unit)
     panels[0].set_yticks(range(len(rows)), names)
     panels[0].invert_yaxis()

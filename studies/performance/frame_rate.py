@@ -26,7 +26,7 @@ from render.display import display_available
 from render.viewer import Controls
 from render.vulkan_device import vulkan_devices
 from scenes.scene import EMBEDDED
-from studies.study_results import write_results
+from studies.study import Results, write_results
 from version import VERSION
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ class ScriptedHand:
         if measured_s > 0 and self._used_s is None:
             self._used_s, self.loop.times = self._used(), self.times
         if self._used_s is not None and measured_s >= MEMORY_EVERY_S * len(self.memory_mb):
-            self.memory_mb.append(sum(each.memory_info().rss for each in self._processes()) / 1e6)
+            self.memory_mb.append(sum(process.memory_info().rss for process in self._processes()) / 1e6)
         if measured_s > self.seconds:
             self.end()
 
@@ -122,8 +122,8 @@ class ScriptedHand:
         return [this, *this.children(recursive=True)]
 
     def _used(self) -> float:
-        times = [each.cpu_times() for each in self._processes()]
-        return sum(each.user + each.system for each in times)
+        times = [process.cpu_times() for process in self._processes()]
+        return sum(process.user + process.system for process in times)
 
 
 @command(FrameOptions)
@@ -150,7 +150,7 @@ def frames(options: FrameOptions) -> None:
             # Where the user has closed the window.
             hands[0].end()
             figures = figures_of(run, hands[0], options)
-    write_results(options.out, "frames", figures, summary(figures))
+    write_results(options.out, "frames", Results(figures, summary(figures)))
 
 
 def figures_of(run: "RehearsalRun", hand: ScriptedHand, options: FrameOptions) -> dict[str, Any]:
@@ -184,7 +184,7 @@ def figures_of(run: "RehearsalRun", hand: ScriptedHand, options: FrameOptions) -
         step_lengths_s=lengths_of(steps),
         iterations_least=min(step.iterations for step in steps),
         processor_s_per_s=round(hand.load, 3),
-        memory_mb=[round(each, 1) for each in hand.memory_mb],
+        memory_mb=[round(mb, 1) for mb in hand.memory_mb],
     )
 
 

@@ -7,6 +7,7 @@ import subprocess
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,9 @@ STIFFNESS = 0.95
 ROUNDS, STEPS_A_ROUND = 9, 5
 # Idle threads sleep; otherwise they would slow down what is timed next.
 IDLE = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0"}
+
+
+Runs = dict[str, Callable[[], None]]
 
 
 class NoBound(RuntimeError):
@@ -77,6 +81,13 @@ class Bound:
         """Some iterations on some cores."""
         self._match(threads, iterations, ctypes.c_float(STIFFNESS), *self._arguments)
 
+    def runs(self, iterations: int) -> Runs:
+        """What is timed, by name."""
+        return {
+            "bound_1_core_ms": partial(self.run, iterations, 1),
+            "bound_2_cores_ms": partial(self.run, iterations, 2),
+        }
+
 
 class Pypbd:
     """The same clusters in pypbd, the binding of PositionBasedDynamics, on one core. Raises NoBound."""
@@ -113,6 +124,10 @@ class Pypbd:
         self._stepper.setValueUInt(self._key, iterations)
         self._stepper.step(self._model)
 
+    def runs(self, iterations: int) -> Runs:
+        """What is timed, by name."""
+        return {"pypbd_1_core_ms": partial(self.run, iterations)}
+
 
 def compare(rehearsal: Rehearsal) -> tuple[dict[str, Any], list[str]]:
     """Medians [ms] of the pressed body's step with contacts and of its references, run in turn.
@@ -122,28 +137,20 @@ def compare(rehearsal: Rehearsal) -> tuple[dict[str, Any], list[str]]:
     solver, settings, model = rehearsal.organ.solver, rehearsal.organ.settings, rehearsal.organ.model
     assert isinstance(model, ShapeMatching) and isinstance(model.body, ParticleBody)
     iterations = settings.substeps * settings.iterations
-    alone, weightless = (
-        Solver(ShapeMatching(model.body, model.patches)),
-        replace(settings, gravity=(0.0,) * 3),
-    )
+    alone = Solver(ShapeMatching(model.body, model.patches))
+    weightless = replace(settings, gravity=(0.0,) * 3)
     pose = rehearsal.scripted_pose(script_length_s(rehearsal.case))
     poses = poses_between(pose, pose, settings.substeps)
-    runs: dict[str, Callable[[], None]] = {
+    runs: Runs = {
         "step_ms": lambda: solver.step(settings, poses),
         "without_contacts_ms": lambda: alone.step(weightless),
     }
     missing = []
-    try:
-        bound = Bound(model)
-        runs["bound_1_core_ms"] = lambda: bound.run(iterations, 1)
-        runs["bound_2_cores_ms"] = lambda: bound.run(iterations, 2)
-    except NoBound as reason:
-        missing.append(str(reason))
-    try:
-        other = Pypbd(model)
-        runs["pypbd_1_core_ms"] = lambda: other.run(iterations)
-    except NoBound as reason:
-        missing.append(str(reason))
+    for reference in (Bound, Pypbd):
+        try:
+            runs |= reference(model).runs(iterations)
+        except NoBound as reason:
+            missing.append(str(reason))
     times: dict[str, list[float]] = {name: [] for name in runs}
     pressed = solver.snapshot()
     for _ in range(ROUNDS):
@@ -152,14 +159,16 @@ def compare(rehearsal: Rehearsal) -> tuple[dict[str, Any], list[str]]:
             for _ in range(STEPS_A_ROUND):
                 timed(run, times[name])
     figures: dict[str, Any] = {name: round(float(np.median(ms)), 4) for name, ms in times.items()}
+    step_ms, free_ms = figures["step_ms"], figures["without_contacts_ms"]
+    bound_ms, pypbd_ms = figures.get("bound_2_cores_ms"), figures.get("pypbd_1_core_ms")
     work = model.counts()["memberships"] * iterations / 1e3
     figures |= dict(
         membership_iterations=round(1e3 * work),
-        bound_ms=figures.get("bound_2_cores_ms"),
-        ratio_to_bound=_ratio(figures["step_ms"], figures.get("bound_2_cores_ms")),
-        million_a_second=round(work / figures["without_contacts_ms"], 2),
-        pypbd_million_a_second=_ratio(work, figures.get("pypbd_1_core_ms")),
-        times_pypbd=_ratio(figures.get("pypbd_1_core_ms"), figures["without_contacts_ms"]),
+        bound_ms=bound_ms,
+        ratio_to_bound=_ratio(step_ms, bound_ms),
+        million_a_second=round(work / free_ms, 2),
+        pypbd_million_a_second=_ratio(work, pypbd_ms),
+        times_pypbd=_ratio(pypbd_ms, free_ms),
     )
     return figures, missing
 

@@ -7,10 +7,8 @@ Timed are a scene's press at several sizes, and blocks of more and more particle
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise, repeat
-from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 import pandas as pd
 import psutil
@@ -18,9 +16,7 @@ import taichi as ti
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
-from rehearsal.commands.command_line import arch_option
 from rehearsal.configuration import PRESETS, Setup, setup_of
 from rehearsal.rehearsal import Rehearsal, script_length_s
 from rehearsal.result_files import spread
@@ -30,12 +26,18 @@ from sim.device import start
 from sim.neo_hookean import LATTICE_SETTINGS
 from sim.shapes import Plane
 from sim.solver import Solver, StepSettings
-from studies.harness import build, memory_mb, memory_of_process_mb
+from studies.harness import (
+    block_of_cells,
+    block_of_particles,
+    build,
+    memory_mb,
+    memory_of_process_mb,
+    step_of,
+)
 from studies.performance.lower_bound import compare
 from studies.performance.step_phases import AFTER, BEFORE, CONTACTS, IN_ITERATION, Phases, without_calls
-from studies.study_options import open_study, out_option, scene_argument
-from studies.study_results import finish_axes, table_of, write_results
-from studies.uniform_blocks import block_of_cells, block_of_particles
+from studies.study import CHOSEN, Results, Study, quick_option, study_command
+from studies.tables_and_panels import Curve, draw_panel, panels_of, table_of
 from ultrasound.probe_manipulator import advanced, poses_between
 
 AWAY_MM = 100.0
@@ -86,39 +88,38 @@ class TimedPress:
     warm_up_steps: int
 
 
-@click.command()
-@scene_argument(PAPER)
-@out_option
-@click.option("--quick", is_flag=True, help="Fewer sizes and shorter presses, in less than a minute.")
-@arch_option
-def timing(scene: Path, out: Path, quick: bool, arch: str) -> None:
+@study_command(
+    "timing",
+    quick_option("Fewer sizes and shorter presses, in less than a minute."),
+    scene=PAPER,
+    arch=CHOSEN,
+)
+def timing(study: Study, quick: bool) -> Results:
     """Measure how long a time step of SCENE takes.
 
     Over time, by its pieces, by size, and against a plain loop in C.
     """
-    loaded, anatomy, used = open_study(out, scene, arch)
-    setups = _setups(quick)
-    counts = QUICK_COUNTS if quick else COUNTS
+    scene, anatomy = study.scene
+    setups, counts = _setups(quick), QUICK_COUNTS if quick else COUNTS
     presses, sizes = [], []
     comparison: dict[str, Any] = {}
     missing: list[str] = []
-    with tqdm(total=len(setups) + 2 * len(counts), desc="timing", unit="size") as bar:
+    with study.progress(len(setups) + 2 * len(counts), "size") as bar:
         for setup in setups:
-            rehearsal = build(loaded, anatomy, setup, used)
-            presses.append(measure(rehearsal, setup, QUICK_SHARE if quick else 1.0, used))
+            rehearsal = build(scene, anatomy, setup, study.backend)
+            presses.append(measure(rehearsal, setup, QUICK_SHARE if quick else 1.0, study.backend))
             if setup == PAPERS:
                 comparison, missing = compare(rehearsal)
             bar.update()
-        for size in blocks(counts, used, QUICK_STEPS if quick else STEPS):
+        for size in blocks(counts, study.backend, QUICK_STEPS if quick else STEPS):
             sizes.append(size)
             bar.update()
         bar.total = bar.n
     bound_ms = comparison.get("bound_ms")
     cases = [press.case | dict(bound_ms=bound_ms if press.setup == PAPERS else None) for press in presses]
-    report = dict(arch=used, cases=cases, bound_ms=bound_ms, comparison=comparison, sizes=sizes)
+    report = dict(arch=study.backend, cases=cases, bound_ms=bound_ms, comparison=comparison, sizes=sizes)
     text = "\n".join([table(cases, sizes), *pieces(cases), *against(comparison), *missing])
-    rows = [_flat(case) for case in cases + sizes]
-    write_results(out, "timing", report, text, rows, figure_of(presses, sizes))
+    return Results(report, text, [_flat(case) for case in cases + sizes], figure_of(presses, sizes))
 
 
 def _setups(quick: bool) -> list[Setup]:
@@ -168,9 +169,7 @@ def describe(setup: Setup, solver: Solver, arch: str) -> dict[str, Any]:
         particles=counts["particles"],
         clusters=counts.get("clusters"),
         memberships=counts.get("memberships"),
-        substeps=setup.substeps,
-        iterations=setup.iterations,
-        time_step_s=setup.solver.time_step_s,
+        **step_of(setup),
         arch=arch,
         cores=1 if solver.model.serial else ti.cfg.cpu_max_num_threads,
         memory_mb=round(memory_mb(solver), 3),
@@ -178,9 +177,7 @@ def describe(setup: Setup, solver: Solver, arch: str) -> dict[str, Any]:
 
 
 def blocks(counts: list[int], arch: str, steps: int) -> Iterator[dict[str, Any]]:
-    """Blocks of about ``counts`` particles or nodes at rest on a plane, smallest first, while memory
-    suffices.
-    """
+    """Blocks of about ``counts`` particles or nodes at rest on a plane, while the memory suffices."""
     for make in (_block_of_cells, _block_of_particles):
         each_mb = 0.0
         for count in counts:
@@ -202,12 +199,8 @@ def blocks(counts: list[int], arch: str, steps: int) -> Iterator[dict[str, Any]]
 def _block_of_particles(count: int) -> tuple[Solver, StepSettings, Setup]:
     side = max(4, round(count ** (1 / 3)))
     points = BLOCK_RADIUS_MM * np.indices((side, side, side)).reshape(3, -1).T
-    floor = Plane(UP, -BLOCK_RADIUS_MM / 2)
-    return (
-        block_of_particles(points, BLOCK_RADIUS_MM, [floor]),
-        StepSettings(),
-        setup_of("shape-matching", radius_mm=BLOCK_RADIUS_MM),
-    )
+    solver = block_of_particles(points, BLOCK_RADIUS_MM, [Plane(UP, -BLOCK_RADIUS_MM / 2)])
+    return solver, StepSettings(), setup_of("shape-matching", radius_mm=BLOCK_RADIUS_MM)
 
 
 def _block_of_cells(count: int) -> tuple[Solver, StepSettings, Setup]:
@@ -228,11 +221,11 @@ def _size(case: dict) -> float:
 
 def table(cases: list[dict], sizes: list[dict]) -> str:
     """The paper's Table 5, and the blocks."""
-    title = "Time of a step (ms), over warm-up and press (the paper's Table 5):"
     of_cases, of_sizes = (
-        table_of(COLUMNS.items(), [_flat(case) | dict(size_mm=_size(case)) for case in given])
-        for given in (cases, sizes)
+        table_of(COLUMNS, [_flat(case) | dict(size_mm=_size(case)) for case in timed_cases])
+        for timed_cases in (cases, sizes)
     )
+    title = "Time of a step (ms), over warm-up and press (the paper's Table 5):"
     return "\n".join([title, of_cases, "\nBlocks at rest on a plane:", of_sizes])
 
 
@@ -252,9 +245,8 @@ def against(figures: dict) -> list[str]:
     if not figures:
         return []
     lines = [
-        f"\nIn turn, {PAPERS.size_mm:g} mm, medians: a step with all contacts {figures['step_ms']:.2f} "
-        "ms, without any "
-        f"{figures['without_contacts_ms']:.2f} ms"
+        f"\nIn turn, {PAPERS.size_mm:g} mm, medians: a step with all contacts {figures['step_ms']:.2f} ms, "
+        f"without any {figures['without_contacts_ms']:.2f} ms"
     ]
     if figures["bound_ms"]:
         lines.append(
@@ -265,24 +257,20 @@ def against(figures: dict) -> list[str]:
     if figures["times_pypbd"]:
         lines.append(
             f"  pypbd's shape matching: {figures['pypbd_1_core_ms']:.2f} ms; "
-            f"{figures['pypbd_million_a_second']:.0f} million "
-            f"membership-iterations a second against {figures['million_a_second']:.0f}: "
-            f"{figures['times_pypbd']:.1f} times"
+            f"{figures['pypbd_million_a_second']:.0f} million membership-iterations a second against "
+            f"{figures['million_a_second']:.0f}: {figures['times_pypbd']:.1f} times"
         )
     return lines
 
 
 def figure_of(presses: list[TimedPress], sizes: list[dict]) -> Figure:
     """The paper's Figures 7 and 8, its Table 5 and time against size, in four panels."""
-    figure = Figure(figsize=(13, 9), layout="constrained")
-    panels = figure.subplots(2, 2)
+    figure, ((over_time, pieces_of_step), (radii, by_size)) = panels_of((13, 9), 2, 2)
     matched = [press for press in presses if press.case["model"] == "shape-matching"]
-    _over_time(panels[0, 0], matched[0])
-    _pieces(panels[0, 1], presses)
-    _radii(panels[1, 0], matched)
-    _sizes(panels[1, 1], sizes)
-    for axes in (panels[0, 0], panels[1, 0], panels[1, 1]):
-        finish_axes(axes, legend={})
+    _over_time(over_time, matched[0])
+    _pieces(pieces_of_step, presses)
+    _radii(radii, matched)
+    _sizes(by_size, sizes)
     return figure
 
 
@@ -294,13 +282,16 @@ def _over_time(axes: Axes, press: TimedPress) -> None:
     contacts = contacts.rolling(PIECES_STEPS, center=True, min_periods=1).median()
     elapsed_s = case["time_step_s"] * np.arange(1, len(press.step_ms) + 1)
     warm_up_s = case["time_step_s"] * press.warm_up_steps
-    axes.plot(elapsed_s, press.step_ms, linewidth=0.8, label="whole step")
-    axes.plot(elapsed_s, contacts, linewidth=0.8, label=f"contacts, median of {PIECES_STEPS} steps")
+    name, thin = f"contacts, median of {PIECES_STEPS} steps", dict(linewidth=0.8)
+    curves = [
+        Curve(elapsed_s, press.step_ms, "-", "whole step", thin),
+        Curve(elapsed_s, contacts.to_numpy(), "-", name, thin),
+    ]
+    title = f"Time of a step, {case['particles']} particles of {case['radius_mm']:g} mm (the paper's Fig. 7)"
+    draw_panel(axes, curves, {}, title=title, xlabel="simulated time (s)", ylabel="ms")
     axes.axvline(warm_up_s, color="0.5", linestyle="--", linewidth=0.8)
     axes.annotate(" press", (warm_up_s, 0), color="0.4", va="bottom")
     axes.set_ylim(0, 1.5 * sorted(press.step_ms)[int(0.98 * len(press.step_ms))])
-    title = f"Time of a step, {case['particles']} particles of {case['radius_mm']:g} mm (the paper's Fig. 7)"
-    axes.set(title=title, xlabel="simulated time (s)", ylabel="ms")
 
 
 def _pieces(axes: Axes, presses: list[TimedPress]) -> None:
@@ -313,7 +304,7 @@ def _pieces(axes: Axes, presses: list[TimedPress]) -> None:
     shown = shown.assign(**{"the rest": 100 - shown.sum(axis=1)})
     shown.plot.barh(stacked=True, width=0.8, color=colours, ax=axes)
     axes.set_yticks(
-        range(len(presses)), [f"{each.case['model']} {_size(each.case):g} mm" for each in presses]
+        range(len(presses)), [f"{press.case['model']} {_size(press.case):g} mm" for press in presses]
     )
     axes.invert_yaxis()
     axes.set(title="Pieces of a step (the paper's Fig. 8)", xlabel="% of the step", xlim=(0, 100))
@@ -333,7 +324,7 @@ def _radii(axes: Axes, matched: list[TimedPress]) -> None:
         axes.errorbar(radius, mean, spread, fmt=marker, color=colour, capsize=3, label=name)
     axes.axhline(FRAME_MS, color="0.6", linestyle=":", label="1/60 s")
     title = "Mean, minimum and maximum of a step (the paper's Table 5)"
-    axes.set(title=title, xlabel="particle radius (mm)", ylabel="ms", ylim=(0, None))
+    draw_panel(axes, (), {}, title=title, xlabel="particle radius (mm)", ylabel="ms", ylim=(0, None))
 
 
 def _sizes(axes: Axes, sizes: list[dict]) -> None:
@@ -349,4 +340,4 @@ def _sizes(axes: Axes, sizes: list[dict]) -> None:
             axes.annotate(text, point, fontsize=7, textcoords="offset points", **place)
     axes.axhline(FRAME_MS, color="0.6", linestyle=":", label="1/60 s")
     title = "Blocks at rest: time and memory against size"
-    axes.set(title=title, xlabel="particles or nodes", ylabel="median ms a step")
+    draw_panel(axes, (), {}, title=title, xlabel="particles or nodes", ylabel="median ms a step")

@@ -9,14 +9,11 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
-from rehearsal.commands.command_line import arch_option, make_folder, start_taichi
 from rehearsal.configuration import PRESETS, Setup, setup_of
 from rehearsal.result_files import rounded
 from rehearsal.speed_accuracy import SETTINGS, pareto, preset_of, setup_of_row
@@ -26,12 +23,12 @@ from sim.device import start
 from studies.accuracy.bead_case import BeadCase, load_case
 from studies.accuracy.bead_errors import bead_errors
 from studies.accuracy.bead_experiment import BeadExperiment
-from studies.study_options import out_option
-from studies.study_results import finish_axes, table_of, write_results
+from studies.performance.step_timing import FRAME_MS
+from studies.study import CHOSEN, Results, Study, paths_argument, quick_option, study_command
+from studies.tables_and_panels import draw_panel, panels_of, table_of
 from ultrasound.probe_manipulator import poses_between
 
 EMBEDDED_CASE = Path(__file__).parents[1] / "reference" / "embedded"
-FRAME_MS = 1000 / 60
 COLUMNS = {
     "model": "{model}",
     "size, mm": "{size_mm:g}",
@@ -62,32 +59,31 @@ QUICK = (
 ROUNDS, TIMED_STEPS = 3, 45
 
 
-@click.command()
-@click.argument("cases", metavar="[CASE]...", type=click.Path(path_type=Path), nargs=-1)
-@out_option
-@click.option("--quick", is_flag=True, help="A few settings on the embedded case, in less than a minute.")
-@arch_option
-def trade(cases: tuple[Path, ...], out: Path, quick: bool, arch: str) -> None:
+@study_command(
+    "trade",
+    paths_argument("cases", "[CASE]..."),
+    quick_option("A few settings on the embedded case, in less than a minute."),
+    arch=CHOSEN,
+)
+def trade(study: Study, cases: tuple[Path, ...], quick: bool) -> Results:
     """Measure the error of beads against the time of a step.
 
     Over model, resolution, substeps, iterations and relaxation.
     The error is the mean over the embedded patient's bead experiment and those of CASE..., folders as
     `validate` takes them.
     """
-    make_folder(out)
-    loaded = [load_case(EMBEDDED_CASE), *(load_case(case) for case in cases)]
-    used = start_taichi(arch)
+    loaded = [load_case(case) for case in (EMBEDDED_CASE, *cases)]
     tried, rounds = setups(quick), 0 if quick else ROUNDS
-    runs = _runs(loaded, tried, used, rounds)
-    found = points(tried, list(tqdm(runs, "trade", (len(loaded) + rounds) * len(tried), unit="run")))
-    report = dict(arch=used, cases=[case.name for case in loaded], points=found)
+    runs = _runs(loaded, tried, study.backend, rounds)
+    measured = points(tried, list(study.progress((len(loaded) + rounds) * len(tried), "run", runs)))
+    report = dict(arch=study.backend, cases=[case.name for case in loaded], points=measured)
     # In the table the errors of single cases have columns of their own.
     rows = [
         {name: value for name, value in point.items() if name != "errors_mm"}
         | {f"error_{name}_mm": value for name, value in point["errors_mm"].items()}
-        for point in found
+        for point in measured
     ]
-    write_results(out, "trade", report, table(found), rows, figure_of(found))
+    return Results(report, table(measured), rows, figure_of(measured))
 
 
 def setups(quick: bool) -> list[Setup]:
@@ -113,8 +109,8 @@ def setups(quick: bool) -> list[Setup]:
     return _sorted([*cells, *around, *particles, *stiff, *relaxed, *PAPER, *named])
 
 
-def _sorted(given: list[Setup]) -> list[Setup]:
-    return sorted(dict.fromkeys(given), key=lambda setup: (setup.model, -setup.size_mm))
+def _sorted(chosen: list[Setup]) -> list[Setup]:
+    return sorted(dict.fromkeys(chosen), key=lambda setup: (setup.model, -setup.size_mm))
 
 
 def _runs(cases: list[BeadCase], tried: list[Setup], arch: str, rounds: int) -> Iterator[dict[str, Any]]:
@@ -167,11 +163,13 @@ def _built(case: BeadCase, tried: list[Setup], arch: str) -> Iterator[tuple[int,
     """Each setting and its number, with the experiment for it, built anew on a freshly started device for
     each model and size.
     """
-    for _, sharing in groupby(enumerate(tried), key=lambda each: (each[1].model, each[1].size_mm)):
-        numbered = list(sharing)
+    for _, sharing in groupby(
+        enumerate(tried), key=lambda numbered: (numbered[1].model, numbered[1].size_mm)
+    ):
+        same = list(sharing)
         start(arch)
-        experiment = BeadExperiment(case, numbered[0][1])
-        yield from ((number, experiment, setup) for number, setup in numbered)
+        experiment = BeadExperiment(case, same[0][1])
+        yield from ((number, experiment, setup) for number, setup in same)
 
 
 def _mean_error(case: BeadCase, beads: np.ndarray, finite: bool) -> float:
@@ -201,14 +199,13 @@ def table(points: list[dict[str, Any]]) -> str:
         name = preset_of(setup) or ("the paper's" if setup in PAPER else "")
         words = ", ".join(filter(None, (stiffness, front, name)))
         rows.append(point | dict(size_mm=setup.size_mm, words=words))
-    return table_of(COLUMNS.items(), rows)
+    return table_of(COLUMNS, rows)
 
 
 def figure_of(points: list[dict[str, Any]]) -> Figure:
     """Every point by its time and its error, the Pareto front, the presets and the paper's settings."""
     points = [point for point in points if point["error_mean_mm"] is not None]
-    figure = Figure(figsize=(11, 7), layout="constrained")
-    axes = figure.subplots()
+    figure, ((axes,),) = panels_of((11, 7))
     for model in sorted({point["model"] for point in points}):
         _scatter(axes, [point for point in points if point["model"] == model], model)
     front = sorted(_place(point) for point in points if point["pareto"])
@@ -216,9 +213,9 @@ def figure_of(points: list[dict[str, Any]]) -> Figure:
     axes.plot(ms, error, color="black", linewidth=1.2, label="Pareto front", drawstyle="steps-post")
     axes.axvline(FRAME_MS, color="0.5", linestyle="--", linewidth=0.8)
     axes.annotate(" a frame at 60 Hz", (FRAME_MS, axes.get_ylim()[1]), color="0.4", va="top")
-    finish_axes(
+    draw_panel(
         axes,
-        dict(loc="center right"),
+        legend=dict(loc="center right"),
         title="Speed-accuracy trade-off",
         xlabel="time of a step (ms, median)",
         ylabel="mean error of the beads (mm)",

@@ -11,9 +11,8 @@ from typing import Any
 import click
 import numpy as np
 import trimesh
-from tqdm import tqdm
 
-from rehearsal.commands.command_line import load_patient, make_folder
+from rehearsal.commands.command_line import load_patient
 from rehearsal.configuration import PRESETS, probe_of, scene_of
 from rehearsal.planning.plan_search import make_plan, total_work, try_path, work_at
 from rehearsal.planning.sweep_score import ScoreTerms, score
@@ -23,8 +22,8 @@ from rehearsal.worker_processes import Workers
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import EMBEDDED, Scene
 from studies.planning.baseline_sweeps import UNPLANNED, planned, random_sweep
-from studies.study_options import dask_option, jobs_option, out_option, trials_option
-from studies.study_results import text_table, write_results
+from studies.study import Results, Study, paths_argument, study_command, trials_option
+from studies.tables_and_panels import table_of
 from ultrasound.target import Target
 
 TARGET: Target = "margin"
@@ -36,48 +35,42 @@ TUMOUR_MM, UNDER_MM, ALONG = 10.0, 1.5, 0.35
 PLANNED_ON = PRESETS["neo-hookean"]["balanced"]
 # Another grid and more iterations: a plan that suits only its own model scores badly here.
 JUDGED_ON = PLANNED_ON.but(cell_mm=2.7, iterations=8)
-# The table's columns: header, factor and format of each figure of a row.
 COLUMNS = {
-    "seen": ("covered, %", 100, ".0f"),
-    "compression_mean_mm": ("compression, mean, mm", 1, ".1f"),
-    "compression_max_mm": ("maximum, mm", 1, ".1f"),
-    "contact": ("contact, %", 100, ".0f"),
-    "incidence_deg": ("incidence, deg", 1, ".0f"),
-    "path_mm": ("path, mm", 1, ".0f"),
-    "reachable": ("reachable, %", 100, ".0f"),
-    "score": ("score", 1, ".1f"),
+    "sweep": "{name}",
+    "covered, %": "{seen_percent:.0f}",
+    "compression, mean, mm": "{compression_mean_mm:.1f}",
+    "maximum, mm": "{compression_max_mm:.1f}",
+    "contact, %": "{contact_percent:.0f}",
+    "incidence, deg": "{incidence_deg:.0f}",
+    "path, mm": "{path_mm:.0f}",
+    "reachable, %": "{reachable_percent:.0f}",
+    "score": "{score:.1f}",
 }
 
 
-@click.command("plan")
-@click.argument("scenes", type=click.Path(path_type=Path), nargs=-1)
-@out_option
-@trials_option
-@click.option("--probe", default="drop-in", show_default=True, help="Probe, by its name or as a file.")
-@jobs_option
-@dask_option
-def plan_study(
-    scenes: tuple[Path, ...], out: Path, trials: int, probe: str, jobs: int | None, dask: str | None
-) -> None:
+@study_command(
+    "plan",
+    paths_argument("scenes"),
+    trials_option,
+    click.option("--probe", default="drop-in", show_default=True, help="Probe, by its name or as a file."),
+    has_workers=True,
+)
+def plan_study(study: Study, scenes: tuple[Path, ...], trials: int, probe: str) -> Results:
     """Compare planned sweeps with straight and random ones.
 
     Over the tumour and 5 mm around it, in SCENES [the embedded patient].
     A kidney without a tumour is given one.
     """
-    make_folder(out)
     runs = []
     patients = scenes or (EMBEDDED,)
-    with (
-        Workers(jobs, dask) as workers,
-        tqdm(total=len(patients) * count_of(trials), desc="plan", unit="trial") as bar,
-    ):
-        for number, each in enumerate(patients, 1):
-            scene, loaded = load_patient(each, {"transducer.probe": probe})
+    with study.workers() as workers, study.progress(len(patients) * count_of(trials), "trial") as bar:
+        for number, patient in enumerate(patients, 1):
+            scene, loaded = load_patient(patient, {"transducer.probe": probe})
             anatomy = with_tumour(loaded, np.array(scene.gravity.direction))
             run = compare(scene, anatomy, trials, workers, bar.update)
             runs.append(dict(patient=scene.title or f"patient {number}") | run)
             bar.update(number * bar.total // len(patients) - bar.n)
-    write_results(out, "plan", dict(trials=trials, runs=runs), "\n".join(map(table, runs)))
+    return Results(dict(trials=trials, runs=runs), "\n".join(map(table, runs)))
 
 
 def count_of(trials: int) -> int:
@@ -120,9 +113,7 @@ def compare(
 
 
 def with_tumour(anatomy: LoadedAnatomy, gravity: np.ndarray) -> LoadedAnatomy:
-    """The anatomy with a ball just under the highest point of its organ, unless it has a tumour of its
-    own.
-    """
+    """The anatomy with a ball just under the highest point of its organ, unless it has a tumour."""
     if anatomy.tumour is not None:
         return anatomy
     organ, up = anatomy.organ, -np.asarray(gravity) / np.linalg.norm(gravity)
@@ -139,17 +130,16 @@ def with_tumour(anatomy: LoadedAnatomy, gravity: np.ndarray) -> LoadedAnatomy:
 
 def _row(name: str, outcomes: list[ScoreTerms]) -> dict[str, Any]:
     """Means over several sweeps, and their number."""
-    parts = [asdict(one) | dict(score=score(one)) for one in outcomes]
-    means = {key: float(np.mean([each[key] for each in parts])) for key in parts[0]}
+    parts = [asdict(terms) | dict(score=score(terms)) for terms in outcomes]
+    means = {key: float(np.mean([part[key] for part in parts])) for key in parts[0]}
     return dict(sweep=name, count=len(outcomes), **means)
 
 
 def table(run: dict[str, Any]) -> str:
     """The figures of one patient."""
-    headers, factors, formats = zip(*COLUMNS.values(), strict=True)
     rows = []
     for row in run["rows"]:
         name = row["sweep"] if row["count"] == 1 else f"{row['sweep']} ({row['count']})"
-        rows.append([name, *(factor * row[key] for key, factor in zip(COLUMNS, factors, strict=True))])
-    figures = text_table(["sweep", *headers], rows, ["", *formats])
-    return f"{run['patient']}, {run['probe']}: {run['plan']}\n{figures}\n"
+        percent = {f"{key}_percent": 100 * row[key] for key in ("seen", "contact", "reachable")}
+        rows.append(row | percent | dict(name=name))
+    return f"{run['patient']}, {run['probe']}: {run['plan']}\n{table_of(COLUMNS, rows)}\n"

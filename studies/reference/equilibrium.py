@@ -176,14 +176,14 @@ class Equilibrium:
         step and slide at the other make Newton's method alternate between two states; shorter steps prevent
         that.
         """
-        reach, found = self._line_search(state, balance.work(step), step)
+        reach, after = self._line_search(state, balance.work(step), step)
         for shorter in (reach / 2, reach / 4, reach / 8):
-            if found.size <= balance.size:
+            if after.size <= balance.size:
                 break
             tried = self.balance(state + shorter * step)
             if tried.size < balance.size:
-                reach, found = shorter, tried
-        return state + reach * step, found
+                reach, after = shorter, tried
+        return state + reach * step, after
 
     def _line_search(self, state: np.ndarray, before: float, step: np.ndarray) -> tuple[float, Balance]:
         """The share of a step at which the work is at most half of that before, 1 where that is enough.
@@ -199,8 +199,8 @@ class Equilibrium:
         low, high = 0.0, np.inf
         work_low, work_high = before, 0.0
         for _ in range(SEARCHES):
-            found = self.balance(state + reach * step)
-            work = found.work(step)
+            after = self.balance(state + reach * step)
+            work = after.work(step)
             if before >= 0 or abs(work) <= abs(before) / 2 or (work < 0 and high == np.inf):
                 break
             if work > 0:
@@ -210,5 +210,5 @@ class Equilibrium:
             share = work_low / (work_low - work_high)
             reach = low + (high - low) * float(np.clip(share, 0.1, 0.9))
         else:
-            found = self.balance(state + reach * step)
-        return reach, found
+            after = self.balance(state + reach * step)
+        return reach, after

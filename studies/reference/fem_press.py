@@ -136,9 +136,7 @@ class FemExperiment:
         return state, residual
 
     def _first_guess(self, state: np.ndarray) -> np.ndarray:
-        """Contact with a softer transducer, as a whole increment of overlap would be an unrealistic
-        pressure.
-        """
+        """Contact with a softer transducer: the pressure of an increment of overlap would be unrealistic."""
         stiff = self.probe.law
         self.probe.law = replace(stiff, stiffness_kpa_mm=SOFT_KPA_MM)
         try:

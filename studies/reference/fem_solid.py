@@ -88,9 +88,7 @@ class FemSolid:
             raise MeshError("a curved tetrahedron at the surface is nearly folded over")
 
     def deformation(self, displacement: np.ndarray) -> np.ndarray:
-        """Deformation gradients F at the Gauss points, shape (points, 3, 3), for displacements [mm]
-        (nodes, 3).
-        """
+        """Deformation gradients F (points, 3, 3) at the Gauss points, for displacements (nodes, 3) [mm]."""
         return np.eye(3) + (self._gradient @ displacement).reshape(-1, 3, 3).swapaxes(1, 2)
 
     def least_volume_ratio(self, displacement: np.ndarray) -> float:
@@ -151,9 +149,7 @@ def _values(basis: AbstractBasis) -> np.ndarray:
 
 
 def _operator(basis: AbstractBasis, values: np.ndarray) -> csr_array:
-    """Sparse matrix from the nodes to what the shape functions have as ``values`` (10, elements, ...), in
-    this order.
-    """
+    """Sparse matrix from the nodes to what the shape functions have as ``values`` (10, elements, ...)."""
     rows = np.broadcast_to(np.arange(values[0].size).reshape(values[0].shape), values.shape)
     nodes = basis.element_dofs.reshape(*values.shape[:2], *[1] * (values.ndim - 2))
     places = rows.ravel(), np.broadcast_to(nodes, values.shape).ravel()

@@ -1,9 +1,12 @@
-"""Make the reference: the embedded patient's kidney on its support, solved on two meshes."""
+"""Make the reference: the embedded patient's kidney on its support, solved on two meshes; and the same of a
+kidney with a crater, solved once.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
 from time import perf_counter
 
+import igl
 import numpy as np
 import trimesh
 from skfem import MeshTet2
@@ -19,14 +22,6 @@ BEADS, BEAD_DEPTH_MM, BEAD_SEED, CANDIDATES_A_BEAD = 45, 3.0, 20160705, 10
 # Edges far from the transducer are longer; Mmg makes them shorter where the surface is round.
 GROWTH, BULK_OF_NEAR = 1.0, 5.0
 COARSER = 1.4
-
-
-def graded_mesh(kidney: trimesh.Trimesh, press: FemPress, near_mm: float) -> MeshTet2:
-    """Tetrahedra that fill the kidney, with edges of ``near_mm`` where the transducer touches it.
-
-    Raises MeshError.
-    """
-    return tetrahedra(kidney, size_around(kidney, press, near_mm))
 
 
 def size_around(
@@ -84,7 +79,7 @@ def solved(
     """The experiment on one mesh; surfaces and beads (n, 3) in the frame of the files [mm]."""
     start = perf_counter()
     press = FemPress()
-    mesh = graded_mesh(kidney, press, near_mm)
+    mesh = tetrahedra(kidney, size_around(kidney, press, near_mm))
     report(f"{mesh.nelements} tetrahedra, {mesh.doflocs.shape[1]} nodes")
     experiment = FemExperiment(mesh, support, FemMaterial(), press, report)
     stages = list(experiment.stages())
@@ -99,9 +94,7 @@ def solved(
 
 
 def in_case_frame(surface: trimesh.Trimesh, gravity: np.ndarray, organ: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A surface in the frame of the files: z against gravity, x along the organ's length, its centre of
-    mass 0.
-    """
+    """A surface in the files' frame: z against gravity, x along the organ, the organ's centre of mass 0."""
     up = -np.asarray(gravity, float) / np.linalg.norm(gravity)
     length = np.linalg.svd(organ.vertices - organ.vertices.mean(axis=0), full_matrices=False)[2][0]
     x = length - (length @ up) * up
@@ -126,3 +119,51 @@ def blue_noise(surface: trimesh.Trimesh, count: int = BEADS, depth_mm: float = B
             apart = np.linalg.norm(points[:, None] - chosen[None], axis=2).min(axis=1, initial=np.inf)
             chosen = np.vstack([chosen, points[apart.argmax()]])
     return chosen
+
+
+def pressed_beads(
+    organ: trimesh.Trimesh,
+    bed: trimesh.Trimesh,
+    support: trimesh.Trimesh,
+    beads: np.ndarray,
+    near_mm: float,
+    indentations_mm: np.ndarray,
+) -> tuple[np.ndarray, ...]:
+    """Beads in an organ with a crater; it takes half an hour for edges of 4 mm: store the result.
+
+    Args:
+        organ: its closed surface, in the frame of ``in_case_frame`` [mm].
+        bed: the faces of the crater, which have edges of ``near_mm`` as the tissue by the transducer has.
+        support: closed surface [mm].
+        beads: places at rest [mm], shape (n, 3).
+        near_mm: length of the edges there.
+        indentations_mm: of each stage, the first 0, shape (stages,).
+
+    Returns:
+        Beads at each stage [mm], shape (stages, n, 3); the transducer's centre [mm] and its force on the
+        tissue [N], shape (stages, 3).
+
+    Raises:
+        MeshError: no mesh fills the organ.
+        NotConvergedError: no equilibrium was found.
+    """
+    press = FemPress(indentations_mm=tuple(indentations_mm.tolist()))
+    experiment = FemExperiment(_mesh(organ, bed, press, near_mm), support, FemMaterial(), press)
+    stages = list(experiment.stages())
+    at_beads = experiment.solid.basis.probes(beads.T)
+    return (
+        np.stack([beads + at_beads @ stage.displacement_mm for stage in stages]),
+        np.stack([stage.position_mm for stage in stages]),
+        np.stack([stage.probe_force_n for stage in stages]),
+    )
+
+
+def _mesh(organ: trimesh.Trimesh, bed: trimesh.Trimesh, press: FemPress, near_mm: float) -> MeshTet2:
+    by_press = size_around(organ, press, near_mm)
+    vertices, faces = np.asarray(bed.vertices, float), np.asarray(bed.faces, np.int64)
+
+    def wanted(points: np.ndarray) -> np.ndarray:
+        from_bed = np.sqrt(igl.point_mesh_squared_distance(points, vertices, faces)[0])
+        return np.minimum(by_press(points), np.maximum(from_bed, near_mm))
+
+    return tetrahedra(organ, wanted)

@@ -36,9 +36,7 @@ class Law:
         return self.stiffness_kpa_mm * (soft**2 / (2 * self.soft_mm) + depth - soft)
 
     def most_slip(self, pressure: np.ndarray) -> np.ndarray:
-        """Slip [mm] at which the friction has reached Coulomb's limit, shape (n,); beyond it the anchor
-        follows.
-        """
+        """Slip (n,) [mm] at which friction reaches Coulomb's limit; beyond it the anchor follows."""
         return (1 + self.blend) * self.friction * pressure / self.stick_kpa_mm
 
     def friction_share(self, stretch: np.ndarray) -> np.ndarray:
@@ -80,9 +78,7 @@ class PenaltyContact:
         return self.obstacle.gap(self.places(displacement))
 
     def carry(self, displacement: np.ndarray) -> None:
-        """End an increment: the anchor of a sliding point follows it by its slip, that of a free point
-        wholly.
-        """
+        """End an increment: the anchor of a sliding point follows by its slip, that of a free one wholly."""
         places = self.places(displacement)
         gap = self.obstacle.gap(places)
         touching = np.flatnonzero(gap < 0)

@@ -9,7 +9,7 @@ import trimesh
 from rehearsal.commands.command_line import CommandError, make_folder
 from scenes.anatomy import load_anatomy
 from scenes.scene import PAPER, load_scene
-from studies.study_options import number_option
+from studies.study import number_option
 
 
 @click.command()

@@ -93,9 +93,7 @@ def _curved(straight: MeshTet, surface: trimesh.Trimesh) -> MeshTet2:
 
 
 def unfolded(mesh: MeshTet2) -> MeshTet2:
-    """The mesh with straight edges where tetrahedra would fold over, or nearly: at a sharp edge of the
-    surface.
-    """
+    """The mesh with straight edges where tetrahedra would (nearly) fold over: at the surface's edges."""
     while len(folded := _folded(mesh)):
         straight = MeshTet2.from_mesh(MeshTet(mesh.doflocs[:, : mesh.t.max() + 1], mesh.t))
         middles = Dofs(mesh, ElementTetP2()).element_dofs[4:, folded]

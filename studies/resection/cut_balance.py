@@ -6,24 +6,24 @@ Nephron has the lattice of the whole organ, of which ``remove_tissue`` takes the
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import trimesh
 
 from rehearsal.configuration import PRESETS, Setup
-from rehearsal.resection.cut import Cut, CutSettings, cut_organ, faces_of
-from scenes.anatomy import LoadedAnatomy, load_anatomy
+from rehearsal.resection.cut import CutSettings, cut_organ, faces_of
+from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, PAPER, load_scene
 from scenes.surfaces import translated
 from sim.neo_hookean import NeoHookean
 from sim.removed_tissue import RemovedTissue
 from sim.solver import StepSettings
+from sim.stored_arrays import stored
 from studies.accuracy.bead_case import BeadCase, load_case
 from studies.accuracy.bead_errors import bead_errors, null_errors
 from studies.accuracy.bead_experiment import BeadExperiment
-from studies.resection.cut_lines import line_over
+from studies.resection.planned_cuts import line_over
 from ultrasound.probe_manipulator import poses_between
 
 UNCUT = Path(__file__).parents[1] / "reference" / "embedded"
@@ -43,16 +43,15 @@ class CutCase:
 
 
 class CutBeadExperiment(BeadExperiment):
-    """A bead experiment on an organ from which tissue is removed: before it settles, or when the whole
-    organ has settled.
-    """
+    """A bead experiment on an organ from which tissue is removed, before or after the whole has settled."""
 
     def __init__(self, cut: CutCase, setup: Setup, settles_first: bool) -> None:
         super().__init__(cut.case, setup)
         self.settles_first = settles_first
         tissue = cut.tissue
         self._organ, removed, remaining = (
-            translated(each, -self.origin) for each in (cut.case.organ, tissue.removed, tissue.remaining)
+            translated(surface, -self.origin)
+            for surface in (cut.case.organ, tissue.removed, tissue.remaining)
         )
         self._tissue = RemovedTissue(removed, remaining, tissue.is_new)
 
@@ -75,31 +74,22 @@ class CutBeadExperiment(BeadExperiment):
 
 @dataclass(frozen=True)
 class BalanceRow:
-    """Mean and largest error of the beads [mm] at each stage, and how far they moved since the first one
-    in the mean.
-    """
+    """Errors of the beads (stages, n) [mm] in a case."""
 
     organ: str
     setup: Setup
     case: BeadCase
     errors: np.ndarray
 
-    @cached_property
-    def means_mm(self) -> list[float]:
-        """Mean error at each stage [mm]."""
-        return [float(stage.mean()) for stage in self.errors]
-
     @property
     def is_within(self) -> bool:
         """Whether the mean error is within 0.15 mm at each stage."""
-        return max(self.means_mm) <= BALANCE_BAR_MM
+        return bool(self.errors.mean(axis=1).max() <= BALANCE_BAR_MM)
 
     def described(self) -> dict[str, object]:
-        """Values for the table and the files."""
-
-        def joined(values: np.ndarray) -> str:
-            return " / ".join(f"{value:.2f}" for value in values)
-
+        """Values for the table and the files: mean and largest error at each stage, and how far the beads
+        moved since the first one in the mean.
+        """
         return dict(
             organ=self.organ,
             beads=len(self.case.beads),
@@ -111,6 +101,11 @@ class BalanceRow:
         )
 
 
+def joined(values: np.ndarray) -> str:
+    """Values (stages,) in words."""
+    return " / ".join(f"{value:.2f}" for value in values)
+
+
 def balance_rows() -> tuple[list[BalanceRow], np.ndarray]:
     """The errors of the uncut kidney and of the remnant, and the distances (stages, n) [mm] of the remnant's
     beads from those of the coarser mesh.
@@ -118,7 +113,9 @@ def balance_rows() -> tuple[list[BalanceRow], np.ndarray]:
     Taichi must be started. Raises MeshError, NotConvergedError.
     """
     setup = PRESETS["neo-hookean"]["balanced"]
-    uncut = _first_stages(load_case(UNCUT))
+    whole = load_case(UNCUT)
+    arrays = ("measured", "poses", "indentation_mm", "probe_force_n")
+    uncut = replace(whole, **{name: getattr(whole, name)[:STAGES] for name in arrays})
     cut, to_coarser = cut_case(uncut)
     experiments = {
         "whole": BeadExperiment(uncut, setup),
@@ -126,37 +123,35 @@ def balance_rows() -> tuple[list[BalanceRow], np.ndarray]:
         "settled, then cut": CutBeadExperiment(cut, setup, settles_first=True),
     }
     rows = [
-        BalanceRow(name, setup, each.case, bead_errors(each.case, each.run(setup).beads))
-        for name, each in experiments.items()
+        BalanceRow(name, setup, tried.case, bead_errors(tried.case, tried.run(setup).beads))
+        for name, tried in experiments.items()
     ]
     return rows, to_coarser
 
 
-def _first_stages(case: BeadCase) -> BeadCase:
-    arrays = ("measured", "poses", "indentation_mm", "probe_force_n")
-    return replace(case, **{name: getattr(case, name)[:STAGES] for name in arrays})
-
-
 def cut_case(uncut: BeadCase) -> tuple[CutCase, np.ndarray]:
-    """The case of the remnant, pressed as the uncut one is, and the distances (stages, n) [mm] of its beads
-    from those of the coarser mesh.
+    """The case of the embedded patient's remnant, pressed as the uncut kidney is, and the distances
+    (stages, n) [mm] of its beads from those of the coarser mesh.
 
     Raises MeshError, NotConvergedError, ResectionError.
     """
-    from studies.reference.make_reference import blue_noise, in_case_frame
-    from studies.reference.pressed_beads import pressed_beads
+    from studies.reference.make_reference import blue_noise, in_case_frame, pressed_beads
 
-    anatomy, gravity = embedded_anatomy(), np.array(load_scene(PAPER).gravity.direction)
-    cut = embedded_cut(anatomy)
-    organ, specimen, remnant = (
-        in_case_frame(each, gravity, anatomy.organ) for each in (anatomy.organ, cut.specimen, cut.remnant)
+    anatomy, paper = load_anatomy(load_scene(EMBEDDED), EMBEDDED.parent), load_scene(PAPER)
+    assert anatomy.tumour is not None
+    line = line_over(anatomy.organ, anatomy.tumour, SETTINGS.margin_mm)
+    cut = cut_organ(anatomy.organ, line, SETTINGS, np.asarray(anatomy.tumour.vertices))
+    support_lps = load_anatomy(paper, PAPER.parent).shapes[0]
+    assert isinstance(support_lps, trimesh.Trimesh)
+    organ, specimen, remnant, support = (
+        in_case_frame(surface, np.array(paper.gravity.direction), anatomy.organ)
+        for surface in (anatomy.organ, cut.specimen, cut.remnant, support_lps)
     )
-    support = load_anatomy(load_scene(PAPER), PAPER.parent).shapes[0]
-    assert isinstance(support, trimesh.Trimesh)
     beads, bed = blue_noise(remnant), faces_of(remnant, cut.on_remnant)
-    given = remnant, bed, in_case_frame(support, gravity, anatomy.organ), beads
-    coarse = pressed_beads(*given, COARSER_MM, uncut.indentation_mm)[0]
-    measured, at, force = pressed_beads(*given, EDGE_MM, uncut.indentation_mm)
+    (coarse, *_), (measured, at, force) = (
+        stored(pressed_beads, remnant, bed, support, beads, edge_mm, uncut.indentation_mm)
+        for edge_mm in (COARSER_MM, EDGE_MM)
+    )
     poses = uncut.poses.copy()
     poses[:, :3, 3] = at
     case = replace(
@@ -164,15 +159,3 @@ def cut_case(uncut: BeadCase) -> tuple[CutCase, np.ndarray]:
     )
     tissue = RemovedTissue(specimen, remnant, cut.on_remnant)
     return CutCase(case, tissue), np.linalg.norm(measured - coarse, axis=2)
-
-
-def embedded_anatomy() -> LoadedAnatomy:
-    """The embedded patient, whose kidney is that of the uncut case."""
-    return load_anatomy(load_scene(EMBEDDED), EMBEDDED.parent)
-
-
-def embedded_cut(anatomy: LoadedAnatomy) -> Cut:
-    """The cut of the embedded patient: enucleoresection with a margin of 3 mm."""
-    assert anatomy.tumour is not None
-    line = line_over(anatomy.organ, anatomy.tumour, SETTINGS.margin_mm)
-    return cut_organ(anatomy.organ, line, SETTINGS, np.asarray(anatomy.tumour.vertices))

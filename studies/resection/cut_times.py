@@ -1,8 +1,6 @@
 """Times of a cut: from the request until it is shown, of its parts, its judgement, and of steps."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import TypeVar
+from collections import defaultdict
 
 import numpy as np
 
@@ -14,7 +12,7 @@ from rehearsal.resection.operation import cut_command
 from rehearsal.resection.proposal import marks_around
 from rehearsal.resection.score_line import ResectionError, score_line
 from rehearsal.stopwatch import timed
-from studies.resection.cut_lines import line_over
+from studies.resection.planned_cuts import line_over
 from ultrasound.anatomy_volumes import AnatomyVolumes
 from ultrasound.crater import Crater
 
@@ -24,27 +22,13 @@ MARGIN_MM = 5.0
 DIFFERENT_MM = 0.01
 # Steps before and after the cut are timed in turn, in so many rounds of so many.
 ROUNDS, STEPS = 5, 60
-Result = TypeVar("Result")
+# Durations [ms] of each repeat, by name.
+Times = dict[str, list[float]]
 
 
-@dataclass
-class CutTimes:
-    """Durations [ms] of each repeat, by name."""
-
-    ms: dict[str, list[float]] = field(default_factory=dict)
-
-    def measure(self, name: str, call: Callable[[], Result]) -> Result:
-        """Call, add the duration, and return what the call returns."""
-        return timed(call, self.ms.setdefault(name, []))
-
-    def medians(self) -> dict[str, float]:
-        """The median of each [ms]."""
-        return {name: round(float(np.median(values)), 2) for name, values in self.ms.items()}
-
-
-def cut_times(rehearsal: Rehearsal) -> CutTimes:
+def cut_times(rehearsal: Rehearsal) -> Times:
     """Cut and undo several times, then step. Needs a tumour and a scanner. Raises ResectionError."""
-    times, anatomy = CutTimes(), rehearsal.anatomy
+    times, anatomy = defaultdict[str, list[float]](list), rehearsal.anatomy
     assert anatomy.scanner is not None
     # What images need is there before the first cut.
     volumes = anatomy.scanner.volumes
@@ -54,11 +38,11 @@ def cut_times(rehearsal: Rehearsal) -> CutTimes:
         mark, cut = commands(anatomy, settings)
         rehearsal.reset()
         rehearsal.do(mark)
-        frame = times.measure("request to cut applied", lambda: rehearsal.do(cut))
+        frame = timed(lambda: rehearsal.do(cut), times["request to cut applied"])
         if frame.notices:
             raise ResectionError(frame.notices[0])
-        times.measure("judgement", lambda: anatomy.judgement)
-        times.measure("undo", lambda: rehearsal.do(Undo()))
+        timed(lambda: anatomy.judgement, times["judgement"])
+        timed(lambda: rehearsal.do(Undo()), times["undo"])
         _time_parts(rehearsal, volumes, settings, times)
     _time_steps(rehearsal, mark, cut, times)
     return times
@@ -73,23 +57,21 @@ def commands(anatomy: DeformedAnatomy, settings: CutSettings) -> tuple[Mark, Cut
     return Mark(places_mm=marks.tolist()), cut_command(anatomy, settings, None)
 
 
-def _time_parts(
-    rehearsal: Rehearsal, volumes: AnatomyVolumes, settings: CutSettings, times: CutTimes
-) -> None:
+def _time_parts(rehearsal: Rehearsal, volumes: AnatomyVolumes, settings: CutSettings, times: Times) -> None:
     """The parts of the cut one by one, on the whole organ, which is whole again afterwards."""
     organ, tumour = rehearsal.case.organ, rehearsal.case.tumour
     assert tumour is not None
     marks, seen = rehearsal.frame.resection.points(), np.asarray(tumour.vertices)
-    line = times.measure("- line", lambda: score_line(organ, marks))
-    made = times.measure("- specimen and remnant", lambda: cut_organ(organ, line, settings, seen))
-    times.measure("- tissue and contacts", lambda: rehearsal.organ.apply_cut(made))
+    line = timed(lambda: score_line(organ, marks), times["- line"])
+    made = timed(lambda: cut_organ(organ, line, settings, seen), times["- specimen and remnant"])
+    timed(lambda: rehearsal.organ.apply_cut(made), times["- tissue and contacts"])
     crater = Crater(made.specimen, settings.filling)
-    times.measure("- crater in the image", lambda: volumes.set_crater(crater))
+    timed(lambda: volumes.set_crater(crater), times["- crater in the image"])
     rehearsal.organ.apply_cut(None)
     volumes.set_crater(None)
 
 
-def _time_steps(rehearsal: Rehearsal, mark: Mark, cut: CutOut, times: CutTimes) -> None:
+def _time_steps(rehearsal: Rehearsal, mark: Mark, cut: CutOut, times: Times) -> None:
     operations = {"step before the cut": (), "step after the cut": (mark, cut)}
     for _ in range(ROUNDS):
         for name, operation in operations.items():
@@ -97,4 +79,4 @@ def _time_steps(rehearsal: Rehearsal, mark: Mark, cut: CutOut, times: CutTimes) 
             rehearsal.do(*operation)
             stay = Move(pose=rehearsal.organ.pose)
             frame = rehearsal.do(*[stay] * STEPS)
-            times.ms.setdefault(name, []).extend(step.took_ms for step in frame.steps)
+            times[name] += [step.took_ms for step in frame.steps]

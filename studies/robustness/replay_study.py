@@ -8,7 +8,6 @@ import click
 import numpy as np
 from tqdm import tqdm
 
-from rehearsal.commands.command_line import arch_option
 from rehearsal.configuration import PRESETS
 from rehearsal.live_settings import initial_settings
 from rehearsal.loop.command import Checkpoint, Follow
@@ -25,8 +24,7 @@ from scenes.scene import EMBEDDED
 from scenes.tissue import TISSUES, USUAL
 from settings import Value, with_values
 from studies.harness import build
-from studies.study_options import number_option, open_study, out_option, preset_option, scene_argument
-from studies.study_results import write_results
+from studies.study import CHOSEN, Results, Study, number_option, preset_option, study_command
 
 SEED = 20161130
 # Time between two changes of the input, and distance of the mouse ray's origin from the organ.
@@ -38,32 +36,33 @@ PROBABILITY = {"undo": 0.06, "redo": 0.03, "bookmark": 0.03, "to_bookmark": 0.02
 PACE_PROBABILITY = 0.02
 
 
-@click.command()
-@scene_argument(EMBEDDED)
-@out_option
-@number_option("--minutes", low=0.05, high=600, default=10.0, help="Simulated minutes.")
-@click.option(
-    "--model", type=click.Choice(list(TISSUES)), default=USUAL, show_default=True, help="Tissue model."
+@study_command(
+    "replay",
+    number_option("--minutes", low=0.05, high=600, default=10.0, help="Simulated minutes."),
+    click.option(
+        "--model", type=click.Choice(list(TISSUES)), default=USUAL, show_default=True, help="Tissue model."
+    ),
+    preset_option,
+    scene=EMBEDDED,
+    arch=CHOSEN,
 )
-@preset_option
-@arch_option
-def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arch: str) -> None:
+def replay(study: Study, minutes: float, model: str, quality: str) -> Results:
     """Record a session in SCENE and compute it again.
 
     Its input is random; from its file it is computed twice, and once from its middle.
     """
-    loaded, anatomy, used = open_study(out, scene, arch)
-    steps = round(60 * minutes / loaded.solver.time_step_s)
+    scene, anatomy = study.scene
+    steps = round(60 * minutes / scene.solver.time_step_s)
 
     def rehearsal() -> Rehearsal:
-        return build(loaded, anatomy, PRESETS[model][quality], used)
+        return build(scene, anatomy, PRESETS[model][quality], study.backend)
 
-    with tqdm(total=round(3.5 * steps), desc="replay", unit="step") as bar:
-        path, digest = recorded(rehearsal(), anatomy, used, out, steps, bar)
+    with study.progress(round(3.5 * steps), "step") as bar:
+        path, digest = recorded(rehearsal(), anatomy, study, steps, bar)
         log = read_log(path)
         runs = [replayed(rehearsal(), log, from_s, bar) for from_s in (0.0, 0.0, log.length_s / 2)]
-    figures = dict(
-        arch=used,
+    report = dict(
+        arch=study.backend,
         model=model,
         quality=quality,
         file=path.name,
@@ -74,17 +73,17 @@ def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arc
         digest=digest,
         replays=runs,
     )
-    write_results(out, "replay", figures, summary(figures))
+    return Results(report, summary(report))
 
 
 def recorded(
-    rehearsal: Rehearsal, anatomy: LoadedAnatomy, arch: str, out: Path, steps: int, bar: tqdm
+    rehearsal: Rehearsal, anatomy: LoadedAnatomy, study: Study, steps: int, bar: tqdm
 ) -> tuple[Path, str]:
     """Record a restless user for so many steps; the session's file, and a hash of the tissue at its end."""
     case, timeline = rehearsal.case, rehearsal.timeline
     step_s, notices = case.scene.solver.time_step_s, Notices()
-    header = header_of(case, anatomy, arch, rehearsal.organ.model.serial, step_s, begins=None)
-    recorder = SessionRecorder(next_path(out), header, notices)
+    header = header_of(case, anatomy, study.backend, rehearsal.organ.model.serial, step_s, begins=None)
+    recorder = SessionRecorder(next_path(study.out), header, notices)
     user = UserSource(rehearsal.anatomy, rehearsal.manipulator, notices)
     pace, random = Pace(step_s), np.random.default_rng(SEED)
     for controls in restless_controls(rehearsal, steps):
@@ -159,8 +158,7 @@ def summary(figures: dict[str, Any]) -> str:
     lines = [
         f"recorded  {figures['minutes']:g} minutes, {figures['moments']} steps, {figures['ways_back']} of "
         f"them undone, redone, reset or returned to a bookmark; {figures['megabytes']:.1f} MB "
-        f"in {figures['file']}; "
-        f"final state {figures['digest']}"
+        f"in {figures['file']}; final state {figures['digest']}"
     ]
     for run in figures["replays"]:
         same = run["digest"] == figures["digest"] and run["differs_s"] is None

@@ -1,16 +1,13 @@
 """The command ``study soak``: hours of rehearsal, faster than real time: drift and differences."""
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
-from tqdm import tqdm
 
-from rehearsal.commands.command_line import WholeRange, arch_option
 from rehearsal.configuration import PRESETS, Setup
 from rehearsal.pressed_organ import OrganState
 from rehearsal.rehearsal import Rehearsal
@@ -18,8 +15,8 @@ from rehearsal.stopwatch import timed
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import EMBEDDED, Scene
 from studies.harness import build, distances_after_fit, memory_of_process_mb, positions_of
-from studies.study_options import open_study, out_option, scene_argument
-from studies.study_results import finish_axes, table_of, write_results
+from studies.study import CHOSEN, Results, Study, quick_option, study_command, whole_option
+from studies.tables_and_panels import curves_by, draw_panel, panels_of, table_of
 from ultrasound.probe_manipulator import advanced
 
 SEED = 20161130
@@ -52,28 +49,31 @@ COLUMNS = {
 }
 
 
-@click.command()
-@scene_argument(EMBEDDED)
-@out_option
-@click.option(
-    "--minutes", type=WholeRange(1, 6000), default=HOUR, show_default=True, help="Simulated minutes."
+@study_command(
+    "soak",
+    whole_option("--minutes", 1, 6000, HOUR, "Simulated minutes."),
+    quick_option("A quarter of a simulated minute of each model."),
+    click.option("--model", type=click.Choice(list(PRESETS)), help="One tissue model [all]."),
+    scene=EMBEDDED,
+    arch=CHOSEN,
 )
-@click.option("--quick", is_flag=True, help="A quarter of a simulated minute of each model.")
-@click.option("--model", type=click.Choice(list(PRESETS)), help="One tissue model [all].")
-@arch_option
-def soak(scene: Path, out: Path, minutes: int, quick: bool, model: str | None, arch: str) -> None:
+def soak(study: Study, minutes: int, quick: bool, model: str | None) -> Results:
     """Rehearse for an hour in SCENE, faster than real time.
 
     Does the rest shape drift, memory grow, a replay differ?
     """
-    loaded, anatomy, used = open_study(out, scene, arch)
     minutes, minute_s = (1, QUICK_MINUTE_S) if quick else (minutes, MINUTE_S)
     setups = [presets["fast"] for name, presets in PRESETS.items() if model in (None, name)]
-    total = len(setups) * (minutes + min(minutes, REPLAYED_MINUTES))
-    with tqdm(total=total, desc="soak", unit="min") as bar:
-        runs = [run_soak(loaded, anatomy, setup, minutes, minute_s, used, bar.update) for setup in setups]
-    rows = [dict(model=run["model"]) | row for run in runs for row in run["minutes"]]
-    write_results(out, "soak", dict(arch=used, runs=runs), table(runs), rows, figure_of(runs))
+    with study.progress(len(setups) * (minutes + min(minutes, REPLAYED_MINUTES)), "min") as bar:
+        runs = [
+            run_soak(*study.scene, setup, minutes, minute_s, study.backend, bar.update) for setup in setups
+        ]
+    return Results(dict(arch=study.backend, runs=runs), table(runs), rows_of(runs), figure_of(runs))
+
+
+def rows_of(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The minutes of all models."""
+    return [dict(model=run["model"]) | row for run in runs for row in run["minutes"]]
 
 
 def run_soak(
@@ -89,21 +89,18 @@ def run_soak(
     rehearsal = build(scene, anatomy, setup, arch)
     organ = rehearsal.organ
     first, begun = organ.snapshot(), organ.digest()
-
-    def drive(numbers: range) -> list[dict[str, Any]]:
-        rows = []
-        for number in numbers:
-            rows.append(_minute(rehearsal, number, minute_s, first))
-            done()
-        return rows
-
     replayed = range(max(minutes - REPLAYED_MINUTES, 0), minutes)
-    rows = drive(range(replayed.start))
-    snapshot = organ.snapshot()
-    rows += drive(replayed)
+    rows = []
+    for number in range(minutes):
+        if number == replayed.start:
+            before = organ.snapshot()
+        rows.append(_minute(rehearsal, number, minute_s, first))
+        done()
     ended = organ.digest()
-    organ.restore(snapshot)
-    drive(replayed)
+    organ.restore(before)
+    for number in replayed:
+        _minute(rehearsal, number, minute_s, first)
+        done()
     again = organ.digest()
     organ.restore(first)
     return dict(
@@ -170,26 +167,20 @@ def table(runs: list[dict[str, Any]]) -> str:
             f"memory {run['memory_growth_mb']:+.1f} MB; replay {same['replay']}; reset {same['reset']}; "
             f"state restored {run['fallbacks']} times"
         )
-    return "\n".join([table_of(COLUMNS.items(), rows), *lines])
+    return "\n".join([table_of(COLUMNS, rows), *lines])
 
 
 def figure_of(runs: list[dict[str, Any]]) -> Figure:
     """Shape, position, memory and time of a step over the minutes."""
-    figure = Figure(figsize=(11, 7), layout="constrained")
-    panels = figure.subplots(2, 2, sharex=True)
+    figure, panels = panels_of((11, 7), 2, 2, sharex=True)
+    begins_mb = {run["model"]: run["minutes"][0]["memory_mb"] for run in runs}
+    rows = [row | dict(memory_mb=row["memory_mb"] - begins_mb[row["model"]]) for row in rows_of(runs)]
     for axes, (name, label) in zip(panels.ravel(), SHOWN.items(), strict=True):
-        for run in runs:
-            rows = run["minutes"]
-            begins = rows[0][name] if name == "memory_mb" else 0.0
-            at = [row["minute"] for row in rows]
-            axes.plot(at, [row[name] - begins for row in rows], marker=".", label=run["model"])
+        draw_panel(axes, curves_by(rows, "minute", name, "model", ".-"))
         axes.set_title(label, fontsize=10)
-        finish_axes(axes)
         low, high = axes.get_ylim()
-        if name == "memory_mb":
-            axes.set_ylim(min(low, -LEAST_MB), max(high, LEAST_MB))
-        else:
-            axes.set_ylim(0, 1.05 * high)
+        is_memory = name == "memory_mb"
+        axes.set_ylim((min(low, -LEAST_MB), max(high, LEAST_MB)) if is_memory else (0, 1.05 * high))
     for axes in panels[1]:
         axes.set_xlabel("simulated minutes, each of random presses and drags and a rest")
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(runs))

@@ -17,10 +17,9 @@ from sim.neo_hookean import LATTICE_SETTINGS, NeoHookean
 from sim.shapes import ConvexTool, Plane
 from sim.skinning import Skin
 from sim.solver import Solver, StepSettings
-from studies.harness import positions_of, rehearsal_of, without_images
+from studies.harness import block_of_cells, block_of_particles, positions_of, rehearsal_of, without_images
 from studies.robustness.stress_cases import Subject
 from studies.robustness.stress_motion import AWAY_MM
-from studies.uniform_blocks import block_of_cells, block_of_particles
 from ultrasound.probe_manipulator import advanced, pose_at, touching
 
 # Bodies other than the kidney rest on a plane [mm].

@@ -77,9 +77,7 @@ def cases_of(model: str) -> list[StressCase]:
 
 
 def quick_cases_of(model: str) -> list[StressCase]:
-    """The last case of each kind on the kidney, which is the hardest, and the first ones of a particle or
-    cell alone.
-    """
+    """The last and hardest case of each kind on the kidney, and the first of a particle or cell alone."""
     chosen: list[StressCase] = []
     for kind in dict.fromkeys(case.kind for case in cases_of(model)):
         of_kind = [case for case in cases_of(model) if case.kind == kind]
@@ -151,9 +149,8 @@ def _states() -> Iterator[StressCase]:
 
 def _each_axis(extreme: str, name: str, along: float, across: float) -> list[tuple[str, tuple]]:
     """A state for each axis, with one number along that axis and another across it."""
-    return [
-        (extreme.format(axis), (name, *(along if each == axis else across for each in AXES))) for axis in AXES
-    ]
+    numbers = {axis: [along if other == axis else across for other in AXES] for axis in AXES}
+    return [(extreme.format(axis), (name, *values)) for axis, values in numbers.items()]
 
 
 STATES: dict[str, list[tuple[str, tuple]]] = {

@@ -3,22 +3,17 @@
 An extreme is applied to a body and released, and what remains of the deformation is measured.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from itertools import groupby
-from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from tqdm import tqdm
 
-from rehearsal.commands.command_line import make_folder
 from rehearsal.result_files import rounded
-from rehearsal.worker_processes import Workers, built_once
+from rehearsal.worker_processes import built_once
 from sim.body import BodyState
 from sim.fields import fill
 from sim.neo_hookean import NeoHookean
@@ -33,13 +28,10 @@ from studies.robustness.stress_cases import (
     quick_cases_of,
 )
 from studies.robustness.stress_motion import AWAY_MM, PROBES, STATES
-from studies.study_options import dask_option, jobs_option, out_option
-from studies.study_results import finish_axes, table_of, write_results
+from studies.study import Results, Study, quick_option, study_command
+from studies.tables_and_panels import draw_panel, panels_of, table_of
 from ultrasound.probe_manipulator import advanced
 
-# Cases of one body in a task, after which the progress bar advances; the process keeps the body for the next
-# task.
-BATCH = 4
 # How a case may end, and its colour; good ends first.
 OUTCOMES = {
     "recovered its position": "#2a7f4f",
@@ -66,51 +58,25 @@ LIFT_MM = 400.0
 YOUNG_KPA, POISSON = 15.0, 0.45
 
 
-@click.command()
-@out_option
-@click.option("--quick", is_flag=True, help="One case of each kind, in one to two minutes.")
-@jobs_option
-@dask_option
-def stability(out: Path, quick: bool, jobs: int | None, dask: str | None) -> None:
+@study_command("stability", quick_option("One case of each kind, in one to two minutes."), has_workers=True)
+def stability(study: Study, quick: bool) -> Results:
     """Stress-test the tissue and see whether it recovers.
 
     Each model, under extremes of settings, tool and state.
     """
-    make_folder(out)
-    given = {model: quick_cases_of(model) if quick else cases_of(model) for model in MODELS}
-    rows: list[dict[str, Any]] = []
-    with tqdm(total=sum(map(len, given.values())), desc="stability", unit="case") as bar:
-        for found in _figures(given, jobs, dask):
-            rows += found
-            bar.update(len(found))
-    text = f"{table(rows)}\n\n{summary(rows)}"
-    write_results(out, "stability", dict(cases=rows), text, rows, figure_of(rows))
+    tasks = [(model, case) for model in MODELS for case in (quick_cases_of if quick else cases_of)(model)]
+    with study.workers() as workers:
+        rows = list(study.progress(len(tasks), "case", workers.map(_run_in_worker, tasks)))
+    return Results(dict(cases=rows), f"{table(rows)}\n\n{summary(rows)}", rows, figure_of(rows))
 
 
-def _figures(
-    given: dict[str, list[StressCase]], jobs: int | None, dask: str | None
-) -> Iterator[list[dict[str, Any]]]:
-    """Batches of figures in the order of the cases, as they are done."""
-    tasks = []
-    for model, cases in given.items():
-        for _, group in groupby(cases, key=lambda case: case.subject):
-            same = list(group)
-            tasks += [(model, same[first : first + BATCH]) for first in range(0, len(same), BATCH)]
-    with Workers(jobs, dask) as workers:
-        yield from workers.map(_run_all, tasks)
-
-
-def _run_all(model: str, cases: list[StressCase]) -> list[dict[str, Any]]:
-    """The figures of cases with the same subject."""
-    subject = cases[0].subject
-    specimen = built_once((model, subject), lambda: prepared(model, subject))
-    return [run(specimen, model, case) for case in cases]
+def _run_in_worker(model: str, case: StressCase) -> dict[str, Any]:
+    """The figures of a case; the process keeps the body for the next one, which mostly has the same."""
+    return run(built_once((model, case.subject), lambda: prepared(model, case.subject)), model, case)
 
 
 class Extremes:
-    """Extreme values over a whole stress test, and the messages of the divergence check where it restored
-    the state.
-    """
+    """Extreme values over a whole stress test, and the messages of the divergence check."""
 
     def __init__(self, specimen: Specimen) -> None:
         self.specimen = specimen
@@ -195,9 +161,7 @@ def _apply(specimen: Specimen, case: StressCase, extremes: Extremes) -> None:
 
 
 def _set_material(specimen: Specimen, heaviest: float, material: Mapping[str, float]) -> None:
-    """Multiply the mass of the middle node and change the material; shape matching has its mass ratio from
-    the start.
-    """
+    """Change the middle node's mass and the material; shape matching has its mass ratio from the start."""
     if isinstance(specimen.model, NeoHookean):
         mass = specimen.mass.copy()
         mass[len(mass) // 2] *= heaviest
@@ -262,20 +226,17 @@ def _reason(rest_error: float, shape_error: float | None) -> str | None:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """A line a model and kind of case: how many, and how they ended."""
-    found = (
-        pd.DataFrame(rows)
-        .groupby(["model", "kind"], sort=False)
-        .agg(
-            cases=("name", "size"),
-            finite=("finite", "sum"),
-            recovered=("recovered", "sum"),
-            restored=("fallback", "count"),
-            worst=("rest_error_mm", "max"),
-            least=("volume_ratio", "min"),
-            most=("volume_ratio", "max"),
-        )
+    kinds = pd.DataFrame(rows).groupby(["model", "kind"], sort=False)
+    counts = kinds.agg(
+        cases=("name", "size"),
+        finite=("finite", "sum"),
+        recovered=("recovered", "sum"),
+        restored=("fallback", "count"),
+        worst=("rest_error_mm", "max"),
+        least=("volume_ratio", "min"),
+        most=("volume_ratio", "max"),
     )
-    return table_of(COLUMNS.items(), found.reset_index().to_dict("records"))
+    return table_of(COLUMNS, counts.reset_index().to_dict("records"))
 
 
 def summary(rows: list[dict[str, Any]]) -> str:
@@ -311,13 +272,12 @@ def figure_of(rows: list[dict[str, Any]]) -> Figure:
     """A panel a model, a bar a kind of case."""
     frame = pd.DataFrame(rows).assign(outcome=[outcome_of(row) for row in rows])
     kinds, models = list(frame.kind.unique()), list(frame.model.unique())
-    figure = Figure(figsize=(12, 0.25 * len(kinds) + 2), layout="constrained")
-    panels = figure.subplots(1, len(models), sharey=True, squeeze=False)[0]
-    for axes, (model, cases) in zip(panels, frame.groupby("model", sort=False), strict=True):
+    figure, panels = panels_of((12, 0.25 * len(kinds) + 2), 1, len(models), sharey=True)
+    for axes, (model, cases) in zip(panels[0], frame.groupby("model", sort=False), strict=True):
         counts = pd.crosstab(cases.kind, cases.outcome).reindex(kinds, columns=list(OUTCOMES), fill_value=0)
         counts.plot.barh(stacked=True, color=OUTCOMES, width=0.8, legend=False, title=model, ax=axes)
-        finish_axes(axes, grid="x", xlabel=f"cases, of {len(cases)}", ylabel="", axisbelow=True)
-    panels[0].invert_yaxis()
+        draw_panel(axes, grid="x", xlabel=f"cases, of {len(cases)}", ylabel="", axisbelow=True)
+    panels[0, 0].invert_yaxis()
     ends = pd.crosstab(frame.outcome, frame.model).reindex(OUTCOMES, columns=models, fill_value=0)
     handles = [
         Patch(color=colour, label=f"{outcome}: {', '.join(map(str, ends.loc[outcome]))}")

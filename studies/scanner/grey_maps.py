@@ -15,7 +15,7 @@ from sim.fields import fill
 from studies.echo.echo_phantom import EchoPhantom
 from studies.image_quality import grey_figures
 from studies.scanner.recorded_speckle import DEPTH_MM, HALF_SECTOR_DEG, RADIUS_MM
-from studies.scanner.scanner_row import ScannerRow
+from studies.scanner.recordings import ScannerRow, rows_of
 
 PART = "grey values"
 # Of the picture of the curved array (PLUS's configuration): mm per pixel, and the pixel at the middle of the
@@ -45,25 +45,23 @@ class GreyMap:
     slope: float
     linear_residual: float
 
+    def power(self) -> np.ndarray:
+        """Grey (n,) of the fitted power."""
+        return self.scale * 10 ** (self.amplitude_db / 20 * self.exponent)
+
 
 def fitted_grey_map(amplitude: np.ndarray, grey: np.ndarray) -> GreyMap:
-    """Return the grey map of pixels (n,)."""
+    """Grey map of pixels (n,)."""
     used = (amplitude > 0) & (grey > FITTED_GREY[0]) & (grey < FITTED_GREY[1])
     decibel, grey = 20 * np.log10(amplitude[used]), grey[used]
     step = np.floor(decibel / STEP_DB).astype(int)
-    kept = [number for number in np.unique(step) if (step == number).sum() >= 20]
-    middle, median = (np.array([np.median(each[step == n]) for n in kept]) for each in (decibel, grey))
-    power = np.polyfit(middle, np.log(median), 1)
-    linear = np.polyfit(middle, median, 1)
-    return GreyMap(
-        middle,
-        median,
-        float(power[0] * 20 / np.log(10)),
-        float(np.exp(power[1])),
-        _rms(np.exp(np.polyval(power, middle)) - median),
-        float(linear[0]),
-        _rms(np.polyval(linear, middle) - median),
-    )
+    steps = [step == number for number in np.unique(step) if (step == number).sum() >= 20]
+    middle, median = (np.array([np.median(values[at]) for at in steps]) for values in (decibel, grey))
+    power, linear = np.polyfit(middle, np.log(median), 1), np.polyfit(middle, median, 1)
+    power_residual = _rms(np.exp(np.polyval(power, middle)) - median)
+    linear_residual = _rms(np.polyval(linear, middle) - median)
+    exponent, scale = float(power[0] * 20 / np.log(10)), float(np.exp(power[1]))
+    return GreyMap(middle, median, exponent, scale, power_residual, float(linear[0]), linear_residual)
 
 
 def _rms(values: np.ndarray) -> float:
@@ -71,9 +69,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def curved_source(picture: np.ndarray, lines: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return scanline and sample, fractional, of each pixel of the curved array's picture, nan outside the
-    sector.
-    """
+    """Scanline and sample, fractional, of the pixels of the curved array's picture, nan beyond the sector."""
     row, column = np.indices(picture.shape)
     depth = RADIUS_MM + (row - FACE_PIXEL[0]) * PIXEL_MM
     # PLUS has the middle half a pixel to the left.
@@ -85,7 +81,7 @@ def curved_source(picture: np.ndarray, lines: int, samples: int) -> tuple[np.nda
 
 
 def linear_source(lines: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return scanline and sample of each pixel of the linear array's image, each (rows, columns)."""
+    """Scanline and sample of each pixel of the linear array's image, each (rows, columns)."""
     rows = np.arange(LINEAR_ROWS.stop - LINEAR_ROWS.start)
     columns = np.arange(LINEAR_COLUMNS.stop - LINEAR_COLUMNS.start)
     sample = LINEAR_FIRST_SAMPLE + LINEAR_SAMPLES_PER_ROW * rows
@@ -95,7 +91,7 @@ def linear_source(lines: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def root_at(amplitude: np.ndarray, line: np.ndarray, sample: np.ndarray) -> np.ndarray:
-    """Return amplitudes at fractional scanlines and samples.
+    """Amplitudes at fractional scanlines and samples.
 
     Interpolated is the fourth root, whose speckle has no deep gaps.
     """
@@ -103,8 +99,8 @@ def root_at(amplitude: np.ndarray, line: np.ndarray, sample: np.ndarray) -> np.n
 
 
 def our_picture(amplitude: np.ndarray, phantom: EchoPhantom) -> np.ndarray:
-    """Return the picture (rows, columns) uint8 that our log compression and scan conversion make of recorded
-    amplitudes (scanlines, samples) of the phantom's probe.
+    """Picture (rows, columns) uint8 that our log compression and scan conversion make of recorded amplitudes
+    (scanlines, samples) of the phantom's probe.
     """
     probe = phantom.probe.model_copy(update={"dyn_range_db": DYNAMIC_RANGE_DB, "grey_map": "linear"})
     phantom.amplitude(probe=probe)
@@ -115,7 +111,7 @@ def our_picture(amplitude: np.ndarray, phantom: EchoPhantom) -> np.ndarray:
 
 
 def on_pixels_of(ours: np.ndarray, phantom: EchoPhantom, picture: np.ndarray) -> np.ndarray:
-    """Return our picture of the curved array at the pixels of PLUS's, 0 outside."""
+    """Our picture of the curved array at the pixels of PLUS's, 0 outside."""
     width, depth, above = phantom.probe.extent_mm
     row, column = np.indices(picture.shape)
     v, u = (row - FACE_PIXEL[0]) * PIXEL_MM, (column - FACE_PIXEL[1] + 0.5) * PIXEL_MM
@@ -123,28 +119,20 @@ def on_pixels_of(ours: np.ndarray, phantom: EchoPhantom, picture: np.ndarray) ->
     return map_coordinates(ours.astype(float), at, order=1, cval=0.0)
 
 
-def map_lines(name: str, found: GreyMap) -> list[ScannerRow]:
-    """Return the lines of the table of a grey map."""
+def map_lines(name: str, grey_map: GreyMap) -> list[ScannerRow]:
+    """Lines of the table of a grey map."""
     note = "PLUS's map, not the scanner's: grey = scale amplitude^exponent"
-    return [
-        ScannerRow(PART, f"{name}: grey map, exponent of the amplitude", found.exponent, None, "", note),
-        ScannerRow(PART, f"{name}: grey map, scale", found.scale, None, "grey", note),
-        ScannerRow(PART, f"{name}: residual of that map", found.power_residual, None, "grey"),
-        ScannerRow(
-            PART,
-            f"{name}: residual of a map linear in dB",
-            found.linear_residual,
-            None,
-            "grey",
-            f"{found.slope:.2f} grey per dB",
-        ),
-    ]
+    slope = f"{grey_map.slope:.2f} grey per dB"
+    return rows_of(
+        PART,
+        (f"{name}: grey map, exponent of the amplitude", grey_map.exponent, None, "", note),
+        (f"{name}: grey map, scale", grey_map.scale, None, "grey", note),
+        (f"{name}: residual of that map", grey_map.power_residual, None, "grey"),
+        (f"{name}: residual of a map linear in dB", grey_map.linear_residual, None, "grey", slope),
+    )
 
 
 def histogram_lines(name: str, image: np.ndarray, note: str = "") -> list[ScannerRow]:
-    """Return median and 90th percentile of a picture's part."""
-    median, most = grey_figures(image)
-    return [
-        ScannerRow(PART, f"{name}: median", median, None, "grey", note),
-        ScannerRow(PART, f"{name}: 90th percentile", most, None, "grey", note),
-    ]
+    """Median and 90th percentile of a picture's part."""
+    figures = zip(("median", "90th percentile"), grey_figures(image), strict=True)
+    return rows_of(PART, *((f"{name}: {figure}", value, None, "grey", note) for figure, value in figures))

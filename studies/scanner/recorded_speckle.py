@@ -18,7 +18,7 @@ from studies.image_quality import (
     speckle_snr,
     without_depth_trend,
 )
-from studies.scanner.scanner_row import ScannerRow
+from studies.scanner.recordings import ScannerRow, rows_of
 from ultrasound.probe import Probe
 
 PART = "speckle"
@@ -38,7 +38,7 @@ class SpeckleRegion(NamedTuple):
     samples: slice
 
     def of(self, signal: np.ndarray) -> np.ndarray:
-        """Return its part of a signal (scanlines, samples)."""
+        """Its part of a signal (scanlines, samples)."""
         return signal[self.scanlines, self.samples]
 
 
@@ -53,7 +53,7 @@ INSIDE, OUTSIDE = SpeckleRegion("dark", slice(265, 300), slice(310, 390)), SPECK
 
 
 def probe_of(recorded_samples: int) -> Probe:
-    """Return a probe with the geometry of the recording, where its scanlines have so many samples."""
+    """A probe with the geometry of the recording, where its scanlines have so many samples."""
     # PLUS counts the sector between the outermost scanlines, we between the outer edges of these.
     half_deg = HALF_SECTOR_DEG * LINES / (LINES - 1)
     return Probe(
@@ -72,52 +72,38 @@ def probe_of(recorded_samples: int) -> Probe:
 
 
 def our_speckle(phantom: EchoPhantom) -> list[np.ndarray]:
-    """Return amplitudes (scanlines, samples) of even tissue, at several places."""
+    """Amplitudes (scanlines, samples) of even tissue, at several places."""
     phantom.fill(backscatter=0.1)
     return [phantom.amplitude(at) for at in np.random.default_rng(SEED).uniform(-200, 200, DRAWS)]
 
 
 def _figures(probe: Probe, region: SpeckleRegion, amplitudes: list[np.ndarray]) -> tuple[float, float, float]:
-    """Return SNR, lateral and axial correlation length [mm] of a region, the means over images."""
-    parts = [without_depth_trend(region.of(each)) for each in amplitudes]
+    """SNR, lateral and axial correlation length [mm] of a region, the means over images."""
+    parts = [without_depth_trend(region.of(amplitude)) for amplitude in amplitudes]
     depth_mm = (region.samples.start + region.samples.stop) / 2 * probe.sample_mm
     spacing = float(probe.line_spacing_mm(np.array([depth_mm]))[0])
-    lateral, axial = (np.mean([correlation_length(each, axis) for each in parts]) for axis in (0, 1))
-    return (
-        float(np.mean([speckle_snr(each) for each in parts])),
-        float(lateral) * spacing,
-        float(axial) * probe.sample_mm,
-    )
+    snr = np.mean([speckle_snr(part) for part in parts])
+    lateral, axial = (np.mean([correlation_length(part, axis) for part in parts]) for axis in (0, 1))
+    return float(snr), float(lateral) * spacing, float(axial) * probe.sample_mm
 
 
 def measurements(iq: np.ndarray, phantom: EchoPhantom) -> list[ScannerRow]:
-    """Return the lines of the table, of the recorded IQ signal (scanlines, samples) and our images of a
-    like probe.
-    """
+    """Lines of the table, of the recorded IQ signal (scanlines, samples) and our images of a like probe."""
     probe, amplitude, simulated = phantom.probe, np.abs(iq), our_speckle(phantom)
-    lines = []
-    not_stated = (
-        f"ours: {FREQUENCY_MHZ:g} MHz, {probe.bandwidth_percent:g} %, f/{probe.f_number:g}; the "
-        "recording's are not stated"
+    ours = f"ours: {FREQUENCY_MHZ:g} MHz, {probe.bandwidth_percent:g} %, f/{probe.f_number:g}"
+    not_stated = f"{ours}; the recording's are not stated"
+    quantities = (
+        ("SNR", "", f"Rayleigh: {RAYLEIGH_SNR:.2f}"),
+        ("lateral correlation length", "mm", not_stated),
+        ("axial correlation length", "mm", not_stated),
     )
+    lines: list[tuple] = []
     for region in SPECKLE:
-        recorded, ours = (_figures(probe, region, each) for each in ([amplitude], simulated))
-        lines += [
-            ScannerRow(
-                PART, f"{region.name}: SNR", recorded[0], ours[0], "", f"Rayleigh: {RAYLEIGH_SNR:.2f}"
-            ),
-            ScannerRow(
-                PART, f"{region.name}: lateral correlation length", recorded[1], ours[1], "mm", not_stated
-            ),
-            ScannerRow(
-                PART, f"{region.name}: axial correlation length", recorded[2], ours[2], "mm", not_stated
-            ),
-        ]
+        pairs = zip(*(_figures(probe, region, images) for images in ([amplitude], simulated)), strict=True)
+        for (quantity, unit, note), pair in zip(quantities, pairs, strict=True):
+            lines.append((f"{region.name}: {quantity}", *pair, unit, note))
     inside, outside = INSIDE.of(amplitude), OUTSIDE.of(amplitude)
-    return [
-        *lines,
-        ScannerRow(
-            PART, "dark part beside the grey disc: contrast", contrast_db(inside, outside), None, "dB"
-        ),
-        ScannerRow(PART, "dark part beside the grey disc: gCNR", gcnr(inside, outside)),
-    ]
+    dark = "dark part beside the grey disc"
+    lines.append((f"{dark}: contrast", contrast_db(inside, outside), None, "dB"))
+    lines.append((f"{dark}: gCNR", gcnr(inside, outside)))
+    return rows_of(PART, *lines)

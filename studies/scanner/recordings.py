@@ -1,5 +1,5 @@
-"""Recordings of real scanners, which are no part of this project: where they are in a folder, and reading
-them.
+"""Recordings of real scanners, which are no part of this project: where they are in a folder, reading them,
+and the rows of what is measured of them.
 """
 
 from dataclasses import dataclass
@@ -12,6 +12,24 @@ from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
 from errors import UserError
+
+
+@dataclass(frozen=True)
+class ScannerRow:
+    """A quantity: of the recording, ours beside it if there is one, its unit, what to know of it."""
+
+    part: str
+    quantity: str
+    recorded: float | None
+    ours: float | None = None
+    unit: str = ""
+    note: str = ""
+
+
+def rows_of(part: str, *lines: tuple) -> list[ScannerRow]:
+    """Rows of one part; a line has quantity, recorded, ours, unit and note, the last of them may lack."""
+    return [ScannerRow(part, *line) for line in lines]
+
 
 # Beside a checkout of the project.
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data" / "us"
@@ -31,9 +49,7 @@ class RecordingError(UserError):
 
 @dataclass(frozen=True)
 class ChannelData:
-    """Echoes of plane waves, ``rf`` (samples, elements, firings), as PyMUST's PWI_disk.mat has them; SI
-    units.
-    """
+    """Echoes of plane waves, ``rf`` (samples, elements, firings), as in PyMUST's PWI_disk.mat; SI units."""
 
     rf: np.ndarray
     sampling_hz: float
@@ -46,8 +62,8 @@ class ChannelData:
 
 
 def read_iq(path: Path) -> np.ndarray:
-    """Return the IQ signal (scanlines, samples) complex128 of a PLUS recording, from the array downwards.
-    Raises RecordingError.
+    """IQ signal (scanlines, samples) complex128 of a PLUS recording, from the array downwards. Raises
+    RecordingError.
 
     PLUS stores I and Q of a sample side by side (RF_IQ_LINE), or a line of I and one of Q (RF_I_LINE_Q_LINE).
     """
@@ -65,12 +81,12 @@ def read_iq(path: Path) -> np.ndarray:
 
 
 def read_picture(path: Path) -> np.ndarray:
-    """Return a recording's picture (rows, columns) float64. Raises RecordingError."""
+    """A recording's picture (rows, columns) float64. Raises RecordingError."""
     return sitk.GetArrayFromImage(_read(path)).astype(float).squeeze()
 
 
 def read_channel_data(path: Path) -> ChannelData:
-    """Return PyMUST's rotating disc. Raises RecordingError."""
+    """PyMUST's rotating disc. Raises RecordingError."""
     try:
         content = loadmat(path, squeeze_me=True)
         rf, fields = content["RF"].astype(float), content["param"]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from studies.scanner.scanner_row import ScannerRow
+from studies.scanner.recordings import ScannerRow, rows_of
 from ultrasound.probe import Probe
 from ultrasound.pulse import DB_OF_NEPER
 from ultrasound.reverberation import BANDS, FALL_IN_AIR, LENS, MORE_IN_AIR_DB
@@ -43,19 +43,19 @@ class RingDown:
     noise_db: float
 
     def fitted_db(self, depth: np.ndarray) -> np.ndarray:
-        """Return the law's level [dB] at depths in wavelengths."""
+        """Law's level [dB] at depths in wavelengths."""
         return _law_db((self.start_db, self.fall, self.lens, self.phase, self.bands), depth, self.noise_db)
 
 
 def carrier_of(iq: np.ndarray) -> float:
-    """Return the frequency [cycles per sample] of which the delay from I to Q (scanlines, samples) is a
-    quarter of the period.
+    """Frequency [cycles per sample] of which the delay from I to Q (scanlines, samples) is a quarter of the
+    period.
 
     The delay is the slope of the phase of their cross-spectrum over frequency.
     """
     window = np.hanning(iq.shape[1])
     in_phase, quadrature = (
-        np.fft.rfft((each - each.mean(axis=1, keepdims=True)) * window) for each in (iq.real, iq.imag)
+        np.fft.rfft((part - part.mean(axis=1, keepdims=True)) * window) for part in (iq.real, iq.imag)
     )
     cross = (in_phase.conj() * quadrature).mean(axis=0)
     frequency = np.fft.rfftfreq(iq.shape[1])
@@ -65,9 +65,7 @@ def carrier_of(iq: np.ndarray) -> float:
 
 
 def fitted_ring_down(iq: np.ndarray, fitted: slice = FITTED, noise: slice = NOISE) -> RingDown:
-    """Return the law that fits the IQ signal (scanlines, samples) of an array in air best, robustly, in
-    dB.
-    """
+    """Law that fits the IQ signal (scanlines, samples) of an array in air best, robustly, in dB."""
     carrier = carrier_of(iq[:, fitted])
     depth = (np.arange(iq.shape[1]) + 0.5) * carrier / 2
     power = np.convolve((np.abs(iq) ** 2).mean(axis=0), np.ones(AVERAGED) / AVERAGED, "same")
@@ -78,8 +76,8 @@ def fitted_ring_down(iq: np.ndarray, fitted: slice = FITTED, noise: slice = NOIS
 
     least, most = [noise_db, 0.5, 2.0, -np.pi, 0.0], [noise_db + 120, 100.0, 12.0, 3 * np.pi, 0.49]
     starts = [(noise_db + 50, 8.0, lens, phase, 0.3) for lens in LENSES for phase in PHASES]
-    fits = [least_squares(residual, each, bounds=(least, most), loss="soft_l1") for each in starts]
-    start_db, fall, lens, phase, bands = min(fits, key=lambda each: each.cost).x
+    fits = [least_squares(residual, start, bounds=(least, most), loss="soft_l1") for start in starts]
+    start_db, fall, lens, phase, bands = min(fits, key=lambda fit: fit.cost).x
     return RingDown(depth, level_db, carrier, fall, lens, bands, phase, start_db, noise_db)
 
 
@@ -91,28 +89,17 @@ def _law_db(law: "np.ndarray | tuple[float, ...]", depth: np.ndarray, noise_db: 
 
 
 def measurements(ring: RingDown, probe: Probe) -> list[ScannerRow]:
-    """Return the lines of the table; ours beside them, the level above the noise that of a probe."""
+    """Lines of the table; ours beside them, the level above the noise that of a probe."""
     ours_db = probe.ringing_db + MORE_IN_AIR_DB - probe.noise_before_gain_db
     visible = float(ring.depth[FITTED][np.flatnonzero(ring.level_db[FITTED] > ring.noise_db + 6)[-1]])
-    return [
-        ScannerRow(PART, "falls to 1/e in", ring.fall, FALL_IN_AIR, "wavelengths", "TGC not stated"),
-        ScannerRow(PART, "period of its bands", ring.lens, LENS, "wavelengths"),
-        ScannerRow(PART, "bands: half of their depth", ring.bands, BANDS, "of the amplitude"),
-        ScannerRow(
-            PART,
-            "at the face, above the noise",
-            ring.start_db - ring.noise_db,
-            ours_db,
-            "dB",
-            "extrapolated: nearer than 12 wavelengths the recording clips",
-        ),
-        ScannerRow(PART, "within 6 dB of the noise from", visible, None, "wavelengths"),
-        ScannerRow(
-            PART,
-            "carrier",
-            ring.cycles_per_sample,
-            None,
-            "cycles per sample",
-            "from the delay between I and Q; rate of sampling not stated",
-        ),
-    ]
+    clips = "extrapolated: nearer than 12 wavelengths the recording clips"
+    sampled = "from the delay between I and Q; rate of sampling not stated"
+    return rows_of(
+        PART,
+        ("falls to 1/e in", ring.fall, FALL_IN_AIR, "wavelengths", "TGC not stated"),
+        ("period of its bands", ring.lens, LENS, "wavelengths"),
+        ("bands: half of their depth", ring.bands, BANDS, "of the amplitude"),
+        ("at the face, above the noise", ring.start_db - ring.noise_db, ours_db, "dB", clips),
+        ("within 6 dB of the noise from", visible, None, "wavelengths"),
+        ("carrier", ring.cycles_per_sample, None, "cycles per sample", sampled),
+    )

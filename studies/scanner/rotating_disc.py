@@ -11,8 +11,7 @@ import numpy as np
 
 from studies.echo.echo_phantom import EchoPhantom
 from studies.echo.simus_beam import pymust
-from studies.scanner.recordings import ChannelData
-from studies.scanner.scanner_row import ScannerRow
+from studies.scanner.recordings import ChannelData, ScannerRow, rows_of
 from ultrasound.doppler import Doppler, autocorrelation
 from ultrasound.probe import Probe
 
@@ -45,9 +44,7 @@ class Rotation:
 
 
 def probe_of(data: ChannelData) -> Probe:
-    """Return a probe with the array of the recording, whose velocity scale is the limit of its pulse
-    repetition.
-    """
+    """A probe with the array of the recording, whose velocity scale is the limit of its pulse repetition."""
     width_mm = 1e3 * data.pitch_m * data.rf.shape[1]
     return Probe(
         transducer_name="recorded array",
@@ -63,7 +60,7 @@ def probe_of(data: ChannelData) -> Probe:
 
 
 def beamformed(data: ChannelData, x_m: np.ndarray, z_m: np.ndarray) -> np.ndarray:
-    """Return the IQ signal (x, z, firings) by delay and sum, 0 beyond the recorded depths.
+    """IQ signal (x, z, firings) by delay and sum, 0 beyond the recorded depths.
 
     Raises EchoStudyError without pymust.
     """
@@ -79,13 +76,13 @@ def beamformed(data: ChannelData, x_m: np.ndarray, z_m: np.ndarray) -> np.ndarra
     matrix = must.dasmtx(1j * np.array([samples, elements]), x, z, np.zeros((1, elements)), parameters)
     channels = signal.transpose(1, 0, 2).reshape(samples * elements, firings)
     return np.stack(
-        [(matrix @ channels[:, each]).reshape(x.shape, order="F") for each in range(firings)], axis=-1
+        [(matrix @ channels[:, firing]).reshape(x.shape, order="F") for firing in range(firings)], axis=-1
     )
 
 
 def our_velocity(phantom: EchoPhantom, iq: np.ndarray) -> np.ndarray:
-    """Return the velocity away from the array [m/s] (scanlines, tissue samples) that our sample volume and
-    phase make of an ensemble of IQ (scanlines, tissue samples, firings) of the phantom's probe.
+    """Velocity away from the array [m/s] (scanlines, tissue samples) that our sample volume and phase make of
+    an ensemble of IQ (scanlines, tissue samples, firings) of the phantom's probe.
     """
     phantom.fill()
     phantom.amplitude()
@@ -95,32 +92,32 @@ def our_velocity(phantom: EchoPhantom, iq: np.ndarray) -> np.ndarray:
 
 
 def fitted_rotation(x_m: np.ndarray, z_m: np.ndarray, velocity_m_s: np.ndarray) -> Rotation:
-    """Return the rotation that fits best, by least squares, points (n,)."""
+    """Rotation that fits best, by least squares, points (n,)."""
     system = np.column_stack([np.ones_like(x_m), x_m, z_m])
     offset, slope, depth_slope = np.linalg.lstsq(system, velocity_m_s, rcond=None)[0]
     return Rotation(float(offset), float(slope), float(depth_slope), x_m, z_m, velocity_m_s)
 
 
 def disc_of(energy: np.ndarray, x_m: np.ndarray, z_m: np.ndarray) -> np.ndarray:
-    """Return which points of a grid, energy (x, z), are in the inner part of a bright disc."""
+    """Which points of a grid, energy (x, z), are in the inner part of a bright disc."""
     x, z = np.meshgrid(x_m, z_m, indexing="ij")
-    bright = (
-        (energy > energy.max() * 10 ** (LEAST_ENERGY_DB / 10))
-        & (z > DEPTHS_MM[0] / 1e3)
-        & (z < DEPTHS_MM[1] / 1e3)
-    )
+    bright = (energy > energy.max() * 10 ** (LEAST_ENERGY_DB / 10)) & _is_recorded(z)
     area = bright.sum() * (x_m[1] - x_m[0]) * (z_m[1] - z_m[0])
     centre_x, centre_z = np.median(x[bright]), np.median(z[bright])
     return np.hypot(x - centre_x, z - centre_z) < INNER * np.sqrt(area / np.pi)
 
 
+def _is_recorded(z_m: np.ndarray) -> np.ndarray:
+    return (1e3 * z_m > DEPTHS_MM[0]) & (1e3 * z_m < DEPTHS_MM[1])
+
+
 def rotation_of(data: ChannelData) -> Rotation:
-    """Return the rotation that our Doppler finds in channel data. Taichi must run."""
+    """Rotation that our Doppler finds in channel data. Taichi must run."""
     phantom = EchoPhantom(probe_of(data))
     probe, sound = phantom.probe, phantom.bmode.sound
     x_m = probe.elements()[:, 0] / 1e3
     z_m = sound.stride_of(probe) * probe.sample_mm / 1e3 * np.arange(sound.most)
-    recorded = (1e3 * z_m > DEPTHS_MM[0]) & (1e3 * z_m < DEPTHS_MM[1])
+    recorded = _is_recorded(z_m)
     iq = np.zeros((len(x_m), len(z_m), data.rf.shape[-1]), complex)
     iq[:, recorded] = beamformed(data, x_m, z_m[recorded])
     velocity = our_velocity(phantom, iq)
@@ -130,18 +127,13 @@ def rotation_of(data: ChannelData) -> Rotation:
 
 
 def measurements(rotation: Rotation) -> list[ScannerRow]:
-    """Return the lines of the table; beside ours is an independent evaluation of the same recording."""
+    """Lines of the table; beside ours is an independent evaluation of the same recording."""
     residual = 1e3 * float(np.median(np.abs(rotation.residual_m_s)))
+    slope, depth_slope = rotation.slope_per_s, rotation.depth_slope_per_s
     note = "recorded: an independent evaluation; ours: our Doppler"
-    return [
-        ScannerRow(PART, "axial velocity: lateral slope", 61.4, rotation.slope_per_s, "m/s per m", note),
-        ScannerRow(
-            PART,
-            "axial velocity: slope with depth",
-            0.2,
-            rotation.depth_slope_per_s,
-            "m/s per m",
-            "0 in a rotation",
-        ),
-        ScannerRow(PART, "median residual", 8.6, residual, "mm/s", f"{len(rotation.x_m)} points of the disc"),
-    ]
+    return rows_of(
+        PART,
+        ("axial velocity: lateral slope", 61.4, slope, "m/s per m", note),
+        ("axial velocity: slope with depth", 0.2, depth_slope, "m/s per m", "0 in a rotation"),
+        ("median residual", 8.6, residual, "mm/s", f"{len(rotation.x_m)} points of the disc"),
+    )

@@ -11,8 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.ndimage import find_objects, label
 
-from studies.scanner.recordings import RecordingError
-from studies.scanner.scanner_row import ScannerRow
+from studies.scanner.recordings import RecordingError, ScannerRow, rows_of
 from ultrasound.beam import lateral_profiles
 from ultrasound.probe import Probe
 from ultrasound.sweep import load_constants
@@ -35,7 +34,7 @@ class PixelSize:
 
 
 def pixel_size(configuration: Path) -> PixelSize:
-    """Return what a PLUS configuration states: ImageToProbe and the upper edge of its clip rectangle.
+    """What a PLUS configuration states: ImageToProbe and the upper edge of its clip rectangle.
 
     Raises SweepError, RecordingError.
     """
@@ -48,8 +47,8 @@ def pixel_size(configuration: Path) -> PixelSize:
 
 
 def wire_widths(images: np.ndarray, size: PixelSize) -> tuple[np.ndarray, np.ndarray]:
-    """Return depth and lateral width at half of its grey value [mm], each (n,), of each wire across the
-    plane: the outer two of each row, as the wires in the middle pass aslant. Images are (n, rows, columns).
+    """Depth and lateral width at half of its grey value [mm], each (n,), of each wire across the plane: the
+    outer two of each row, as the wires in the middle pass aslant. Images are (n, rows, columns).
     """
     depths, widths = [], []
     for image in images:
@@ -64,7 +63,7 @@ def wire_widths(images: np.ndarray, size: PixelSize) -> tuple[np.ndarray, np.nda
 
 
 def _wires_of(image: np.ndarray) -> list[tuple[int, int]]:
-    """Return row and column of the brightest pixel of each bright piece of an image."""
+    """Row and column of the brightest pixel of each bright piece of an image."""
     pieces, _ = label(image > LEAST_GREY)
     places = []
     for number, box in enumerate(find_objects(pieces), start=1):
@@ -76,7 +75,7 @@ def _wires_of(image: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _half_width(row: np.ndarray, peak: int) -> float:
-    """Return the width [pixels] around a peak at half of its value."""
+    """Width [pixels] around a peak at half of its value."""
     half, ends = row[peak] / 2, []
     for step in (-1, 1):
         at = peak
@@ -87,7 +86,7 @@ def _half_width(row: np.ndarray, peak: int) -> float:
 
 
 def beam_width_mm(probe: Probe, depth_mm: float, level_db: float) -> float:
-    """Return the full width of our beam on the middle scanline at a level."""
+    """Full width of our beam on the middle scanline at a level."""
     spacing = float(probe.line_spacing_mm(np.array([depth_mm]))[0])
     lag = np.linspace(0, 12.0 / spacing, 1201)
     profile = lateral_profiles(probe, (probe.number_of_scanlines - 1) / 2, np.array([depth_mm]), lag)[0]
@@ -97,27 +96,17 @@ def beam_width_mm(probe: Probe, depth_mm: float, level_db: float) -> float:
 
 
 def measurements(depth_mm: np.ndarray, width_mm: np.ndarray, probe: Probe) -> list[ScannerRow]:
-    """Return the lines of the table: the median width of the wires in steps of depth, and ours at several
-    levels.
-    """
+    """Lines of the table: the median width of the wires in steps of depth, and ours at several levels."""
     lines = []
     step = np.floor(depth_mm / DEPTH_STEP_MM).astype(int)
     for number in np.unique(step):
         if (step == number).sum() < LEAST_WIRES:
             continue
         middle = (number + 0.5) * DEPTH_STEP_MM
+        recorded = float(np.median(width_mm[step == number]))
         ours = [beam_width_mm(probe, middle, level) for level in LEVELS_DB]
-        text = ", ".join(
-            f"{width:.2f} at {level:g} dB" for width, level in zip(ours[1:], LEVELS_DB[1:], strict=True)
-        )
-        lines.append(
-            ScannerRow(
-                PART,
-                f"lateral width at {middle:g} mm",
-                float(np.median(width_mm[step == number])),
-                ours[0],
-                "mm",
-                f"recorded: half of the grey value, whose map is not stated; ours: -6 dB ({text})",
-            )
-        )
-    return lines
+        others = zip(ours[1:], LEVELS_DB[1:], strict=True)
+        text = ", ".join(f"{width:.2f} at {level:g} dB" for width, level in others)
+        note = f"recorded: half of the grey value, whose map is not stated; ours: -6 dB ({text})"
+        lines.append((f"lateral width at {middle:g} mm", recorded, ours[0], "mm", note))
+    return rows_of(PART, *lines)

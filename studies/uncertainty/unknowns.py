@@ -1,4 +1,6 @@
-"""What is not known of a patient's tissue: the parameters that the study varies, and their ranges."""
+"""What is not known of a patient's tissue, with its ranges, and the scripted press with given values of it,
+in a worker: what the surgeon sees and feels.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,8 +9,10 @@ from typing import get_args
 import numpy as np
 
 from rehearsal.case import case_of
+from rehearsal.measurements.tumour_measurements import measure
 from rehearsal.pressed_organ import attachments_of, parts_of
 from rehearsal.rehearsal import Rehearsal
+from rehearsal.worker_processes import built_once
 from scenes.anatomy import LoadedAnatomy
 from scenes.mechanical_tissues import mechanical_properties
 from scenes.scene import Scene
@@ -16,6 +20,7 @@ from scenes.tissue import NeoHookeanTissue, PartMaterial, PartName
 from sim.attachment import total_stiffness
 from sim.material import Material
 from sim.neo_hookean import NeoHookean
+from studies.harness import all_scanlines, rehearsal_of
 
 # Fluid has hardly any shear modulus, whatever the value in the table.
 FLUID_POISSON = 0.495
@@ -56,22 +61,22 @@ def unknowns_of(scene: Scene, anatomy: LoadedAnatomy) -> list[Unknown]:
     """The parameters of a scene ``with_all_parts``, with the ranges of the table of mechanical properties."""
     table, attachment = mechanical_properties(), scene.attachment
     kidney = table.parts[PARENCHYMA]
-    found = [
+    unknowns = [
         Unknown(f"{PARENCHYMA} modulus", "kPa", *kidney.young_kpa),
         Unknown(f"{PARENCHYMA} Poisson's ratio", "", *kidney.poisson, is_ratio=False),
     ]
     for part in parts_of(case_of(scene, anatomy)):
         if part.material.poisson < FLUID_POISSON:
-            found.append(Unknown(f"{part.name} modulus", "kPa", *table.parts[part.name].young_kpa))
+            unknowns.append(Unknown(f"{part.name} modulus", "kPa", *table.parts[part.name].young_kpa))
     if getattr(scene.tissue, "capsule_n_mm", 0) > 0:
-        found.append(Unknown("capsule", "N/mm", *table.capsule_n_mm))
+        unknowns.append(Unknown("capsule", "N/mm", *table.capsule_n_mm))
     if attachment.radius_mm > 0 and attachment.stiffness_n_mm > 0:
-        found.append(Unknown("pedicle", "N/mm", *table.pedicle_n_mm))
+        unknowns.append(Unknown("pedicle", "N/mm", *table.pedicle_n_mm))
     if attachment.fat_kpa_mm > 0:
-        found.append(Unknown("fat", "kPa/mm", *table.fat_kpa_mm))
+        unknowns.append(Unknown("fat", "kPa/mm", *table.fat_kpa_mm))
     if scene.contact.shape_friction > 0:
-        found.append(Unknown("friction", "", *table.friction, is_ratio=False))
-    return found
+        unknowns.append(Unknown("friction", "", *table.friction, is_ratio=False))
+    return unknowns
 
 
 def set_values(rehearsal: Rehearsal, values: Mapping[str, float]) -> None:
@@ -97,8 +102,53 @@ def set_values(rehearsal: Rehearsal, values: Mapping[str, float]) -> None:
     if "friction" in values:
         organ.contacts.coefficient = values["friction"]
     if "pedicle" in values or "fat" in values:
-        given = {"stiffness_n_mm": "pedicle", "fat_kpa_mm": "fat"}
-        changed = {key: values[name] for key, name in given.items() if name in values}
+        keys = {"stiffness_n_mm": "pedicle", "fat_kpa_mm": "fat"}
+        changed = {key: values[name] for key, name in keys.items() if name in values}
         attachment = case.scene.attachment.model_copy(update=changed)
         _, tethers = attachments_of(attachment, case.origin, np.array(case.press.direction))
         model.set_tether(total_stiffness(tethers, model.lattice, case.organ))
+
+
+# Measured at each depth; those of the tumour only where there is one. Its centroid follows.
+QUANTITIES = ("tumour_shift_mm", "to_tumour_mm", "tumour_depth_mm", "margin_mm", "force_n", "compression_mm")
+
+
+@dataclass(frozen=True)
+class PressProblem:
+    """A scene and its anatomy, whose press is computed; ``digest`` tells problems apart."""
+
+    scene: Scene
+    anatomy: LoadedAnatomy
+    digest: str
+
+
+def press_outcome(problem: PressProblem, values: dict[str, float]) -> np.ndarray:
+    """The quantities and the tumour's centroid (depths, 9) [mm, N] of a press with these values.
+
+    NaN for what there is not.
+    """
+    return _press(built_once(problem.digest, lambda: rehearsal_of(problem.scene, problem.anatomy)), values)
+
+
+def _press(rehearsal: Rehearsal, values: dict[str, float]) -> np.ndarray:
+    """Settle from the stress-free shape, then press by stages, to the same poses for all values."""
+    set_values(rehearsal, values)
+    case, organ, anatomy = rehearsal.case, rehearsal.organ, rehearsal.anatomy
+    press, touches = case.press, all_scanlines(case.probe)
+    organ.solver.restart()
+    organ.divergence_check.set_initial_state()
+    organ.pose = rehearsal.pose_at_depth(-200.0)
+    organ.come_to_rest()
+    organ.pose = rehearsal.pose_at_depth(0.0)
+    step_s = organ.settings.time_step_s
+    outcomes = []
+    for stage in range(len(press.indentations_mm)):
+        for step in range(press.stage_steps):
+            rehearsal.advance(rehearsal.scripted_pose((stage * press.stage_steps + step + 1) * step_s))
+        rehearsal.show()
+        measurement = measure(anatomy, case.probe, touches)
+        quantities = [getattr(measurement, name) for name in QUANTITIES]
+        tumour = anatomy.tumour_vertices
+        centroid = tumour.mean(axis=0) if len(tumour) else np.full(3, np.nan)
+        outcomes.append([*(np.nan if q is None else q for q in quantities), *centroid])
+    return np.array(outcomes, float)

@@ -9,8 +9,9 @@ import pytest
 from click.testing import CliRunner
 from conftest import rotation_about
 from small_bead_case import DEPTHS, beads, values, write_case
+from study_runs import refusal
 
-from app import cli, main
+from app import cli
 from rehearsal.build_solver import step_settings
 from rehearsal.configuration import PRESETS, SetupError, choose_setup, setup_of
 from scenes.scene import SolverSection
@@ -202,12 +203,7 @@ def test_validate_twice_prints_and_writes_the_same_but_for_times(monkeypatch, tm
 
 
 def test_validate_reports_mistakes_in_one_line(tmp_path, capsys):
-    def refused(*arguments) -> str:
-        assert main(["validate", *map(str, arguments)]) == 2
-        line = capsys.readouterr().err.strip()
-        assert line.startswith("nephron: ") and "\n" not in line
-        return line
-
+    refused = partial(refusal, capsys, "validate")
     folder = write_case(tmp_path / "ball")
     assert "holds no case.toml" in refused(tmp_path)
     assert "--model" in refused(folder, "--model", "clay")

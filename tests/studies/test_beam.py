@@ -2,12 +2,14 @@
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from conftest import rotation_about
+from study_runs import refusal
 
 from app import main
 from sim.fields import fill
@@ -179,12 +181,10 @@ def test_cells_that_do_not_fill_the_beam_are_refused(device):
 
 
 def test_a_missing_file_is_one_line(tmp_path, capsys):
-    assert main(["beam", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.strip() == f"nephron: {tmp_path}: holds no recordings (*.csv)"
+    refused = partial(refusal, capsys, "beam", tmp_path)
+    assert refused() == f"nephron: {tmp_path}: holds no recordings (*.csv)"
     save(tmp_path / "beam_gravity_a.csv", recording())
-    assert main(["beam", str(tmp_path)]) == 2
-    error = capsys.readouterr().err.strip()
-    assert "beam.stl: cannot be read" in error and "\n" not in error
+    assert "beam.stl: cannot be read" in refused()
 
 
 def test_the_silicone_beam_within_a_tenth(device, data):

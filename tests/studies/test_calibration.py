@@ -4,6 +4,7 @@ import csv
 import json
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,8 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 from small_bead_case import beads, write_case
+from study_runs import refusal
 
-import rehearsal.worker_processes as worker_processes
 import studies.accuracy.accuracy_commands as accuracy_commands
 import studies.accuracy.case_workers as case_workers
 from app import main
@@ -194,13 +195,8 @@ def test_calibrate_writes_tables_figures_and_json(monkeypatch, folders, cases, t
         assert np.asarray(Image.open(out / name).convert("L")).std() > 5
 
 
-def test_calibrate_reports_mistakes_in_one_line(monkeypatch, folders, tmp_path, capsys):
-    def refused(*arguments) -> str:
-        assert main(["calibrate", *map(str, arguments)]) == 2
-        line = capsys.readouterr().err.strip()
-        assert line.startswith("nephron: ") and "\n" not in line
-        return line
-
+def test_calibrate_reports_mistakes_in_one_line(folders, tmp_path, capsys):
+    refused = partial(refusal, capsys, "calibrate")
     a, out = folders[0], ("--out", tmp_path / "out")
     assert "--out" in refused(a)
     assert "CASE" in refused(*out)
@@ -212,10 +208,6 @@ def test_calibrate_reports_mistakes_in_one_line(monkeypatch, folders, tmp_path, 
     assert "--radii is '0.1'" in refused(a, *out, "--radii", "0.1")
     assert "--hold-out" in refused(a, *out, "--hold-out", "nothing")
     assert "there is one case" in refused(a, *out, "--hold-out", "cases")
-    monkeypatch.setattr(worker_processes, "CONNECT_S", 0.3)
-    assert "no scheduler answers there" in refused(a, *out, "--dask", "tcp://127.0.0.1:9")
-    monkeypatch.setitem(__import__("sys").modules, "distributed", None)
-    assert "pip install dask distributed" in refused(a, *out, "--dask", "tcp://127.0.0.1:9")
 
 
 @pytest.mark.usefixtures("nothing_built")

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 from ball_patient import folder_of_ball
+from study_runs import refusal
 
 import app
 from errors import UserError
@@ -333,9 +334,8 @@ def test_a_folder_with_something_else_is_refused(tmp_path, capsys, text, words):
     file = tmp_path / "cohort.json"
     file.write_bytes(text if isinstance(text, bytes) else text.encode())
     before = file.read_bytes()
-    assert run([tmp_path], tmp_path) == 2
-    said = capsys.readouterr().err.strip()
-    assert words in said and "choose another --out" in said and "\n" not in said
+    line = refusal(capsys, "study", "cohort", tmp_path, "--out", tmp_path)
+    assert words in line and "choose another --out" in line
     assert file.read_bytes() == before
 
 

@@ -6,8 +6,9 @@ from functools import partial
 import pytest
 from click.testing import CliRunner
 from small_bead_case import write_case
+from study_runs import refusal
 
-from app import cli, main
+from app import cli
 from rehearsal.configuration import PRESETS, Setup, choose_setup, setup_of
 from studies.accuracy.bead_case import BeadCase, load_case
 from studies.accuracy.bead_experiment import BeadRun
@@ -90,5 +91,5 @@ def test_validate_prints_and_writes_what_the_settings_change(monkeypatch, tmp_pa
 
 def test_sizes_that_cannot_be_changed_are_refused(capsys, tmp_path):
     folder = write_case(tmp_path / "ball")
-    assert main(["validate", str(folder), "--cell", "0.6", "--check", "--arch", "cpu"]) == 2
-    assert "--cell from 0.75 to 15" in capsys.readouterr().err
+    line = refusal(capsys, "validate", folder, "--cell", 0.6, "--check", "--arch", "cpu")
+    assert "--cell from 0.75 to 15" in line

@@ -3,12 +3,11 @@ as it began.
 """
 
 import functools
-import json
 
 import pytest
 import taichi as ti
-from PIL import Image
 from small_bead_case import briefly, small_anatomy
+from study_runs import written
 
 import app
 from rehearsal.configuration import PRESETS, setup_of
@@ -21,7 +20,7 @@ from sim.shapes import ConvexTool, SignedDistanceField
 from sim.solver import Solver
 from sim.surface_contact import SurfaceContacts
 from sim.viscoelasticity import Relaxation
-from studies import study_options
+from studies import study
 from studies.harness import memory_mb
 from studies.performance import feature_costs
 from studies.robustness import soak_study
@@ -110,7 +109,7 @@ def test_kernels_are_counted_where_a_step_is_parallel(device):
 
 
 def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(study_options, "load_patient", lambda _: (briefly(0), small_anatomy()))
+    monkeypatch.setattr(study, "load_patient", lambda _: (briefly(0), small_anatomy()))
     monkeypatch.setattr(feature_costs, "SETTLE_STEPS", 3)
     monkeypatch.setattr(feature_costs, "PRESS_STEPS", 3)
     monkeypatch.setitem(
@@ -119,16 +118,11 @@ def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys)
         {"friction on shapes": feature_costs.EVERYWHERE["friction on shapes"]},
     )
     assert app.main(["study", "features", "--quick", "--out", str(tmp_path)]) == 0
-    rows = json.loads((tmp_path / "features.json").read_text())["features"]
-    assert [row["feature"] for row in rows] == [
-        "friction on shapes",
-        "divergence check",
-        "organ's surface",
-    ]
-    for row in rows:
+    report, rows = written(tmp_path, "features")
+    names = ["friction on shapes", "divergence check", "organ's surface"]
+    assert [row["feature"] for row in report["features"]] == [row["feature"] for row in rows] == names
+    for row in report["features"]:
         assert row["mb_on"] > row["mb_off"] and row["ms_on"] > 0
-    assert (tmp_path / "features.csv").is_file()
-    assert Image.open(tmp_path / "features.png").size[0] > 1000
     assert "what is off" not in capsys.readouterr().out
 
 

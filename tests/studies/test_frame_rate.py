@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from settings_at_start import settings_with
+from study_runs import refusal
 
-import app
 from rehearsal.loop.frame import Step
 from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.real_time.start_times import StartTimes
@@ -136,5 +136,5 @@ def test_shares_are_of_the_simulated_time():
 
 def test_without_a_display_it_is_refused_in_one_line(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(frame_rate, "display_available", lambda: False)
-    assert app.main(["study", "frames", "--out", str(tmp_path / "out")]) == 2
-    assert "needs a display" in capsys.readouterr().err and not (tmp_path / "out").exists()
+    line = refusal(capsys, "study", "frames", "--out", tmp_path / "out")
+    assert "needs a display" in line and not (tmp_path / "out").exists()

@@ -14,6 +14,7 @@ from ellipsoid_kidney import HALF_AXES, in_ellipsoid
 from PIL import Image
 from scipy import ndimage
 from scipy.stats import norm
+from study_runs import refusal
 
 import app
 from scenes.anatomy import Grid, LoadedAnatomy
@@ -23,17 +24,28 @@ from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_maps import LabelMap
 from scenes.scene import AnatomyFiles, Scene
 from studies.echo.echo_phantom import EchoPhantom
-from studies.patient_images import patient_image_scans, patient_images_command
+from studies.image_quality import depth_of_noise_mm, snr_db
+from studies.patient_images import patient_image_scans
+from studies.patient_images.image_figures import (
+    agent_figures,
+    capsule_figures,
+    level_at_like_depth,
+    picture_figures,
+    roc_area,
+)
 from studies.patient_images.image_sheet import COLOURS, coloured
 from studies.patient_images.kidney_outline import closed, dice, kidney_contour, outlined_kidney
-from studies.patient_images.patient_image_scans import ImagedPatient
-from studies.patient_images.patient_truth import PatientTruth, on_scanlines, sample_depths
-from studies.patient_images.picture_figures import picture_figures, roc_area
-from studies.patient_images.picture_truth import picture_truth, pixel_places
-from studies.patient_images.scanline_figures import agent_figures, capsule_figures, level_at_like_depth
-from studies.patient_images.scanline_truth import ScanlineTruth, incidence_deg
-from studies.patient_images.signal_to_noise import depth_of_noise_mm, snr_db
-from studies.patient_images.standard_planes import standard_planes
+from studies.patient_images.patient_image_scans import ImagedPatient, standard_planes
+from studies.patient_images.patient_images_command import COLUMNS
+from studies.patient_images.patient_truth import (
+    PatientTruth,
+    ScanlineTruth,
+    incidence_deg,
+    on_scanlines,
+    picture_truth,
+    pixel_places,
+    sample_depths,
+)
 from ultrasound.acoustics import CORTEX_DB, acoustic_table, tissue_table
 from ultrasound.probe import load_probe
 from ultrasound.scanned_anatomy import ScannedAnatomy
@@ -404,6 +416,7 @@ class TestMadePatient:
     def test_what_is_not_labelled_can_be_told_from_the_kidney(self, result):
         (row,) = json.loads((result / "patient-images.json").read_text())["rows"]
         assert (row["patient"], row["title"], row["probe"]) == (1, "Left kidney", "linear")
+        assert {form.strip("{}").split(":")[0] for form in COLUMNS.values()} == set(row)
         assert row["fat_auc"] > 0.85
         assert 0 <= row["outlined"] <= 1 and row["agent_db"] is None
 
@@ -424,16 +437,14 @@ class TestMadePatient:
     def test_a_patient_without_ct_is_refused_in_words(self, tmp_path, capsys):
         trimesh.creation.icosphere(radius=20.0).export(tmp_path / "organ.stl")
         (tmp_path / "scene.toml").write_text('[anatomy]\norgan = "organ.stl"\n')
-        arguments = ["study", "patient-images", str(tmp_path), "--out", str(tmp_path / "out")]
-        assert app.main(arguments) != 0
-        assert "has no CT or no labels" in capsys.readouterr().err
+        line = refusal(capsys, "study", "patient-images", tmp_path, "--out", tmp_path / "out")
+        assert "has no CT or no labels" in line
 
     def test_a_wrong_patient_is_refused_before_any_work(self, tmp_path, capsys):
         out = tmp_path / "out"
         write_patient(made_patient(), tmp_path)
-        arguments = ["study", "patient-images", str(tmp_path), str(tmp_path / "nobody"), "--out", str(out)]
-        assert app.main(arguments) != 0
-        assert "nobody: no such scene" in capsys.readouterr().err and not out.exists()
+        line = refusal(capsys, "study", "patient-images", tmp_path, tmp_path / "nobody", "--out", out)
+        assert "nobody: no such scene" in line and not out.exists()
 
 
 def test_every_tissue_has_a_colour():
@@ -473,8 +484,3 @@ def _index_from_mm(image):
     mm_from_index[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
     mm_from_index[:3, 3] = image.GetOrigin()
     return np.linalg.inv(mm_from_index)
-
-
-def test_the_columns_are_those_of_a_row():
-    names = {form.strip("{}").split(":")[0] for _, form in patient_images_command.COLUMNS}
-    assert names == set(patient_images_command.PatientImageRow.__dataclass_fields__)

@@ -8,13 +8,13 @@ from small_bead_case import briefly, small_anatomy
 import app
 from rehearsal.loop.command import Move
 from rehearsal.sessions.session_file import read_log
-from studies import study_options
+from studies import study
 from studies.robustness import replay_study
 
 
 @pytest.mark.usefixtures("arrays_stored")
 def test_a_session_is_computed_again_to_the_bit(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(study_options, "load_patient", lambda _: (briefly(5), small_anatomy()))
+    monkeypatch.setattr(study, "load_patient", lambda _: (briefly(5), small_anatomy()))
     # Three seconds in which much happens.
     monkeypatch.setattr(replay_study, "CHANGE_S", 0.1)
     monkeypatch.setattr(replay_study, "PACE_PROBABILITY", 0.1)

@@ -12,6 +12,7 @@ import trimesh
 from coarse_patient import coarse_patient
 from cut_ball import R, ball, cap_mm3, cut_by, half_space
 from small_bead_case import write_case
+from study_runs import refusal
 
 import app
 from rehearsal.configuration import setup_of
@@ -21,12 +22,23 @@ from studies.accuracy.bead_case import load_case
 from studies.harness import positions_of
 from studies.resection import resection_command
 from studies.resection.cut_balance import BalanceRow, CutBeadExperiment, CutCase
-from studies.resection.cut_lines import line_over
-from studies.resection.margin_rows import MarginRow, margin_rows
-from studies.resection.random_cuts import RandomResult, random_results, summary, surface_faults
-from studies.resection.random_scores import KINDS, ScoredPatient, random_score
-from studies.resection.voxel_margins import VOXEL_MM, CutFigures, figures_by_voxels, signed_distance_map
-from studies.resection.voxel_solid import RasterGrid
+from studies.resection.planned_cuts import MarginRow, line_over, margin_rows
+from studies.resection.random_cuts import (
+    KINDS,
+    RandomResult,
+    ScoredPatient,
+    random_results,
+    random_score,
+    summary,
+    surface_faults,
+)
+from studies.resection.voxel_margins import (
+    VOXEL_MM,
+    CutFigures,
+    RasterGrid,
+    figures_by_voxels,
+    signed_distance_map,
+)
 
 pytestmark = pytest.mark.usefixtures("arrays_stored")
 
@@ -213,7 +225,6 @@ def test_the_command_writes_what_it_prints(monkeypatch, capsys, tmp_path):
 
 def test_without_finite_elements_it_says_how_to_install_them(monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, "mmgpy", None)
-    assert app.main(["study", "resection", "--part", "balance", "--out", str(tmp_path / "out")]) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1 and "mmgpy" in lines[0] and "requirements-dev.txt" in lines[0]
+    line = refusal(capsys, "study", "resection", "--part", "balance", "--out", tmp_path / "out")
+    assert "mmgpy" in line and "requirements-dev.txt" in line
     assert not (tmp_path / "out").exists()

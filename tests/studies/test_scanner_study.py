@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 import SimpleITK as sitk
+from study_runs import written
 
 import app
 from studies.echo.echo_phantom import EchoPhantom
@@ -310,13 +311,7 @@ class TestCommand:
         assert app.main(["study", "scanner", "--data", str(recordings), "--out", str(tmp_path)]) == 0
         printed = capsys.readouterr().out
         assert "left out" not in printed
-        rows = json.loads((tmp_path / "scanner.json").read_text())["rows"]
-        assert {row["part"] for row in rows} == {
-            "rotating disc",
-            "speckle",
-            "grey values",
-            "ring-down in air",
-            "wires",
-        }
+        report, rows = written(tmp_path, "scanner")
+        parts = {"rotating disc", "speckle", "grey values", "ring-down in air", "wires"}
+        assert {row["part"] for row in report["rows"]} == {row["part"] for row in rows} == parts
         assert all(row["quantity"] in printed for row in rows)
-        assert (tmp_path / "scanner.csv").is_file() and (tmp_path / "scanner.png").is_file()

@@ -7,8 +7,8 @@ import SimpleITK as sitk
 from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_files import open_labels
 from scenes.phantom.embedded_patient import phantom_folder
-from studies.performance import synthetic_trunk
-from studies.performance.synthetic_trunk import GAP_MM, PIXELS, write_whole_body
+from studies.performance import import_timing
+from studies.performance.import_timing import GAP_MM, PIXELS, write_whole_body
 
 
 def embedded() -> tuple[sitk.Image, sitk.Image]:
@@ -19,7 +19,7 @@ def embedded() -> tuple[sitk.Image, sitk.Image]:
 @pytest.fixture(scope="module")
 def body(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(synthetic_trunk, "make_phantom", embedded)
+        patch.setattr(import_timing, "make_phantom", embedded)
         return write_whole_body(tmp_path_factory.mktemp("body") / "b", 24)
 
 

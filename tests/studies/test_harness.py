@@ -9,7 +9,7 @@ from sim.fields import array_of
 from sim.neo_hookean import LATTICE_SETTINGS
 from sim.shapes import Plane
 from sim.solver import StepSettings
-from studies.uniform_blocks import block_of_cells, block_of_particles
+from studies.harness import block_of_cells, block_of_particles
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), -1.0)
 

@@ -1,14 +1,73 @@
-"""Figures of the echoes of a patient's kidney, from scanlines before the grey map: its capsule, and
-contrast agent in its collecting system.
+"""Figures of B-mode images against the truth: of pixels, whether the kidney's border can be seen, grey levels
+and outlines; of scanlines before the grey map, the kidney's capsule and contrast agent in its collecting
+system.
 """
 
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.stats import mannwhitneyu
 
-from studies.patient_images.patient_truth import PatientTruth
-from studies.patient_images.picture_truth import DEPTHS_MM
-from studies.patient_images.scanline_truth import ScanlineTruth
+from studies.image_quality import grey_figures
+from studies.patient_images.kidney_outline import (
+    GOOD_DICE,
+    dice,
+    kidney_contour,
+    outline_by_place,
+    outlined_kidney,
+)
+from studies.patient_images.patient_image_scans import PlaneScan
+from studies.patient_images.patient_truth import DEPTHS_MM, PatientTruth, ScanlineTruth
+
+LEAST_PIXELS = 200
+
+
+def picture_figures(scans: Sequence[PlaneScan]) -> dict[str, float]:
+    """Figures pooled over the planes of a patient and a probe.
+
+    ``fat_auc`` and ``surroundings_auc``: areas under the ROC curve of "brighter than kidney"
+    (``PictureTruth``) of the averaged picture. ``grey_median`` and ``grey_p90`` of all that the scanlines
+    reach. ``outlined``: the share of planes that show kidney and whose outline has a Dice of GOOD_DICE or
+    more; ``outlined_by_place``: the same of an outline that sees no picture.
+    """
+    kidney = _pooled([scan.averaged[scan.truth.judged_kidney] for scan in scans])
+    fat = _pooled([scan.averaged[scan.truth.fat] for scan in scans])
+    surroundings = _pooled([scan.averaged[scan.truth.surroundings] for scan in scans])
+    median, most = grey_figures(_pooled([scan.b_mode[scan.covered] for scan in scans]))
+    outlines = [outline_dice(scan) for scan in scans if (scan.truth.kidney & scan.truth.seen).any()]
+    good, by_place = np.mean(np.array(outlines).reshape(-1, 2) >= GOOD_DICE, axis=0)
+    return dict(
+        fat_auc=roc_area(fat, kidney),
+        surroundings_auc=roc_area(surroundings, kidney),
+        grey_median=median,
+        grey_p90=most,
+        outlined=float(good),
+        outlined_by_place=float(by_place),
+    )
+
+
+def outline_dice(scan: PlaneScan) -> tuple[float, float]:
+    """Dice of the segmenter's outline of the kidney, and of one that sees no picture, in what is seen."""
+    seen = scan.truth.seen
+    contour = kidney_contour(scan.truth.kidney & scan.covered, scan.pixel_mm) & scan.covered
+    centre = np.argwhere(contour & seen).mean(axis=0)
+    outline = outlined_kidney(scan.averaged, scan.covered, centre, scan.pixel_mm)
+    by_place = outline_by_place(scan.covered, centre, scan.pixel_mm)
+    return dice(outline[seen], contour[seen]), dice(by_place[seen], contour[seen])
+
+
+def roc_area(brighter: np.ndarray, darker: np.ndarray) -> float:
+    """Area under the ROC curve of "brighter" (n,) above "darker" (m,), ties one half; NaN of fewer than
+    LEAST_PIXELS.
+    """
+    if min(len(brighter), len(darker)) < LEAST_PIXELS:
+        return float("nan")
+    return float(mannwhitneyu(brighter, darker).statistic / (len(brighter) * len(darker)))
+
+
+def _pooled(parts: Sequence[np.ndarray]) -> np.ndarray:
+    return np.concatenate(list(parts))
+
 
 # Incidence [degrees] of the beam on the capsule.
 SQUARE_DEG, ASLANT_DEG = (0.0, 10.0), (15.0, 20.0)
@@ -28,12 +87,12 @@ BIN_MM, LEAST_SAMPLES = 2.0, 30
 
 
 def decibel(power: float) -> float:
-    """Return a power in dB; NaN of none."""
+    """A power in dB; NaN of none."""
     return float(10 * np.log10(power)) if power > 0 else float("nan")
 
 
 def capsule_figures(truths: Sequence[ScanlineTruth]) -> dict[str, float]:
-    """Return how much the capsule's echo is above the kidney beneath it [dB], where the beam meets it within
+    """How much the capsule's echo is above the kidney beneath it [dB], where the beam meets it within
     SQUARE_DEG and ASLANT_DEG.
 
     On each scanline that crosses the organ's surface into labelled kidney deeper than DEPTHS_MM[0]: the
@@ -55,8 +114,8 @@ def capsule_figures(truths: Sequence[ScanlineTruth]) -> dict[str, float]:
 
 
 def _crossings(truth: ScanlineTruth) -> np.ndarray:
-    """Return of each crossing of the surface (n, 4) the incidence [degrees], and the powers: greatest,
-    greatest of the control, mean inside.
+    """Of each crossing of the surface (n, 4) the incidence [degrees], and the powers: greatest, greatest of
+    the control, mean inside.
     """
     rows = []
     inside = truth.surface_mm < 0
@@ -80,14 +139,14 @@ def _crossings(truth: ScanlineTruth) -> np.ndarray:
 
 
 def _first(where: np.ndarray) -> int:
-    """Return the first index (n,) where something is, or n."""
+    """First index (n,) where something is, or n."""
     return int(where.argmax()) if where.any() else len(where)
 
 
 def agent_figures(truths: Sequence[ScanlineTruth], patient: PatientTruth) -> dict[str, float]:
-    """Return levels [dB] of contrast agent in the collecting system, and of the parenchyma BEHIND_MM behind
-    it, both against parenchyma at like depth that has none before it; NaN where there is none, as in a kidney
-    that is not enhanced.
+    """Levels [dB] of contrast agent in the collecting system, and of the parenchyma BEHIND_MM behind it, both
+    against parenchyma at like depth that has none before it; NaN where there is none, as in a kidney that is
+    not enhanced.
 
     ``agent_db`` is below 0 where the agent is fluid; ``behind_agent_db`` is below 0 in a shadow, above 0
     where fluid enhances.
@@ -121,9 +180,7 @@ def _is_judged(truth: ScanlineTruth) -> np.ndarray:
 
 
 def _behind_agent_mm(truth: ScanlineTruth) -> np.ndarray:
-    """Return how far behind the last contrast agent before it a sample is [mm] (scanlines, samples);
-    infinite without.
-    """
+    """How far behind contrast agent a sample is [mm] (scanlines, samples); infinite without agent."""
     last = np.where(truth.agent_mm < 0, truth.depth_mm, -np.inf)
     return truth.depth_mm - np.maximum.accumulate(last, axis=1)
 
@@ -131,12 +188,12 @@ def _behind_agent_mm(truth: ScanlineTruth) -> np.ndarray:
 def level_at_like_depth(
     power: np.ndarray, depth_mm: np.ndarray, other_power: np.ndarray, other_depth_mm: np.ndarray
 ) -> float:
-    """Return the mean power (n,) of samples over that of others (m,) in the same bins of depth [dB], weighted
-    as the first are; NaN where no bin has LEAST_SAMPLES of both.
+    """Mean power (n,) of samples over that of others (m,) in the same bins of depth [dB], weighted as the
+    first are; NaN where no bin has LEAST_SAMPLES of both.
     """
     bins = [(depth // BIN_MM).astype(int) for depth in (depth_mm, other_depth_mm)]
-    length = max((int(each.max()) + 1 for each in bins if len(each)), default=1)
-    count, other_count = (np.bincount(each, minlength=length) for each in bins)
+    length = max((int(of_depth.max()) + 1 for of_depth in bins if len(of_depth)), default=1)
+    count, other_count = (np.bincount(of_depth, minlength=length) for of_depth in bins)
     total = np.bincount(bins[0], power, length)
     other_total = np.bincount(bins[1], other_power, length)
     both = (count >= LEAST_SAMPLES) & (other_count >= LEAST_SAMPLES)
