@@ -77,8 +77,7 @@ def plan(asked: PlanOptions) -> None:
     port, scene_probe = trocar_of(loaded.trocar, asked), probe_of(loaded)
     make_place(out, "--out")
     from rehearsal.planning.plan_search import make_plan, total_work
-    from rehearsal.planning.sweep_trial import PlanningProblem
-    from rehearsal.planning.trial_workers import TrialWorkers
+    from rehearsal.planning.sweep_trial import PlanningProblem, TrialWorkers
     from rehearsal.worker_processes import Workers
 
     target: Target = asked.target or ("organ" if anatomy.tumour is None else "margin")
@@ -108,7 +107,7 @@ def plan_resection(asked: PlanOptions) -> None:
     from rehearsal.resection.cut import hilum_of
     from rehearsal.resection.proposal import propose, why_first
     from rehearsal.resection.resection_page import draw_page, figures_of
-    from rehearsal.resection.resection_plan import ResectionPlan, planned_cut, write_resection_plan
+    from rehearsal.resection.resection_plan import ResectionPlan, planned_cut
 
     scene, anatomy = load_patient(asked.scene, asked.changes, asked.quality)
     if anatomy.tumour is None:
@@ -117,7 +116,7 @@ def plan_resection(asked: PlanOptions) -> None:
     about = anatomy.organ, anatomy.tumour, anatomy.parts, asked.margin_mm, anatomy.labels, anatomy.tissues
     proposals = propose(*about, hilum_of(scene.attachment, np.zeros(3)))
     cuts = [planned_cut(proposal, np.zeros(3)) for proposal in proposals]
-    write_resection_plan(
+    write_plan(
         ResectionPlan(version=VERSION, anatomy=fingerprint(anatomy), margin_mm=asked.margin_mm, cuts=cuts),
         asked.out,
     )

@@ -24,12 +24,13 @@ from plan_ball import (
     manipulator_on,
 )
 
-from rehearsal.planning.instrument_reach import NEAR_MM, reachable
 from rehearsal.planning.plan_file import LIFT_MM
 from rehearsal.planning.sweep_path import (
+    NEAR_MM,
     STEP_DEG,
     STEP_MM,
     frame_towards,
+    reachable,
     sliding,
     tilted,
     tilting,

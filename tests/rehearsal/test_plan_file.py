@@ -14,7 +14,7 @@ from pydantic import ValidationError
 import app
 from rehearsal.asked_files import check_plan, check_reach
 from rehearsal.commands.plan_command import PlanOptions, over_limit_warning, trocar_of
-from rehearsal.planning import trial_workers
+from rehearsal.planning import sweep_trial
 from rehearsal.planning.plan_file import (
     APPROACH_S,
     LIFT_MM,
@@ -279,7 +279,7 @@ def test_a_plan_is_made_on_the_tissue_of_the_quality(ball_scene, monkeypatch, ca
         cells_mm.append(problem.scene.tissue.cell_mm)
         raise PlanError("no workers")
 
-    monkeypatch.setattr(trial_workers, "TrialWorkers", nobody)
+    monkeypatch.setattr(sweep_trial, "TrialWorkers", nobody)
     for quality in ((), ("--quality", "fast"), ("--quality", "accurate")):
         assert app.main(["plan", str(ball_scene), "--out", str(ball_scene / "plan.json"), *quality]) == 2
         assert "nephron: no workers" in capsys.readouterr().err

@@ -23,6 +23,7 @@ from rehearsal.loop.command import BeginAction, Bookmark, Checkpoint, Load, Mark
 from rehearsal.loop.timeline import Timeline
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.notices import Notices
+from rehearsal.planning.plan_file import write_plan
 from rehearsal.pressed_organ import PressedOrgan
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection import proposal
@@ -44,13 +45,10 @@ from rehearsal.resection.resection_plan import (
     is_resection_plan,
     planned_cut,
     read_resection_plan,
-    write_resection_plan,
 )
-from rehearsal.resection.resection_state import NO_RESECTION
+from rehearsal.resection.resection_state import NO_RESECTION, ResectionScript, ScriptedAction
 from rehearsal.resection.resection_view import ResectionView, cut_settings
-from rehearsal.resection.score_file import save_score
-from rehearsal.resection.score_line import ResectionError
-from rehearsal.resection.script import ResectionScript, ScriptedAction
+from rehearsal.resection.score_line import ResectionError, save_score
 from rehearsal.sessions.packed_arrays import pack_state, unpack_state
 from rehearsal.sessions.recorder import SessionRecorder, header_of
 from rehearsal.sessions.replay import Replay, ReplayCheck
@@ -465,7 +463,7 @@ def test_page_score_and_plan_are_written_and_compared(patient, rehearsal, marks,
     assert (tmp_path / "plan.png").stat().st_size > 10_000
     cuts = [planned_cut(each, np.zeros(3)) for each in proposals]
     plan, path = ResectionPlan(anatomy="a", margin_mm=MARGIN_MM, cuts=cuts), tmp_path / "plan.json"
-    write_resection_plan(plan, path)
+    write_plan(plan, path)
     assert is_resection_plan(path) and read_resection_plan(path) == plan
     with pytest.raises(CommandError, match="the scripted press cuts nothing; open it in a window, or add"):
         read_files(RehearseOptions(headless=True, plan=path))
