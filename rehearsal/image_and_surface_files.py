@@ -11,8 +11,7 @@ import trimesh
 from PIL import Image
 
 from rehearsal.deformed_anatomy import DeformedAnatomy
-from rehearsal.resection.score_file import save_score
-from rehearsal.resection.score_line import LEAST_MARKS, ResectionError, score_line
+from rehearsal.resection.score_line import LEAST_MARKS, ResectionError, save_score, score_line
 from rehearsal.result_files import next_number
 from render.animation import with_square_pixels
 from render.viewer import View

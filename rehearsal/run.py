@@ -29,8 +29,8 @@ from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.real_time.solver_process import SolverEnded
 from rehearsal.real_time.start_times import StartTimes
 from rehearsal.rehearsal import Rehearsal, script_length_s, scripted_pose
+from rehearsal.resection.resection_state import ResectionScript
 from rehearsal.resection.resection_view import ResectionView
-from rehearsal.resection.script import ResectionScript
 from rehearsal.sessions.packed_arrays import pack_seen
 from rehearsal.sessions.recorder import SessionRecorder, header_of, next_path
 from rehearsal.sessions.replay import Replay, ReplayCheck, open_session

@@ -29,10 +29,13 @@ def inset(surface: trimesh.Trimesh) -> float:
 
 def circle(count: int = MARKS, angle: float = ANGLE) -> np.ndarray:
     """Marks (n, 3) on the ball at an angle from its top."""
+    return ring(count, R * np.sin(angle), R * np.cos(angle))
+
+
+def ring(count: int, radius: float, height: float) -> np.ndarray:
+    """Points (n, 3) on a circle about the z axis."""
     turn = 2 * np.pi * np.arange(count) / count
-    return R * np.column_stack(
-        [np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.full(count, np.cos(angle))]
-    )
+    return np.column_stack([radius * np.cos(turn), radius * np.sin(turn), np.full(count, height)])
 
 
 def line_on_ball(organ: trimesh.Trimesh) -> ScoreLine:

@@ -71,8 +71,7 @@ def plan(options: PlanOptions) -> None:
     scene_probe, trocar = probe_of(loaded), loaded.trocar
     make_place(out, "--out")
     from rehearsal.planning.plan_search import make_plan, total_work
-    from rehearsal.planning.sweep_trial import PlanningProblem
-    from rehearsal.planning.trial_workers import TrialWorkers
+    from rehearsal.planning.sweep_trial import PlanningProblem, TrialWorkers
     from rehearsal.worker_processes import Workers
 
     target: Target = options.target or ("organ" if anatomy.tumour is None else "margin")
@@ -102,7 +101,7 @@ def plan_resection(options: PlanOptions) -> None:
     from rehearsal.resection.cut import hilum_of
     from rehearsal.resection.proposal import propose, why_first
     from rehearsal.resection.resection_page import draw_page, figures_of
-    from rehearsal.resection.resection_plan import ResectionPlan, planned_cut, write_resection_plan
+    from rehearsal.resection.resection_plan import ResectionPlan, planned_cut
 
     scene, anatomy = load_patient(options.scene, options.changes, options.quality)
     if anatomy.tumour is None:
@@ -111,7 +110,7 @@ def plan_resection(options: PlanOptions) -> None:
     about = anatomy.organ, anatomy.tumour, anatomy.parts, options.margin_mm, anatomy.labels, anatomy.tissues
     proposals = propose(*about, hilum_of(scene.attachment, np.zeros(3)))
     cuts = [planned_cut(proposal, np.zeros(3)) for proposal in proposals]
-    write_resection_plan(
+    write_plan(
         ResectionPlan(version=VERSION, anatomy=fingerprint(anatomy), margin_mm=options.margin_mm, cuts=cuts),
         options.out,
     )

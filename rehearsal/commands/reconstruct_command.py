@@ -19,7 +19,6 @@ from rehearsal.commands.command_line import (
 )
 from rehearsal.configuration import probe_of
 from rehearsal.reconstruction.reconstruction_files import save_slices_figure, save_volumes
-from rehearsal.reconstruction.simulated_tracker import with_errors
 from rehearsal.reconstruction.sweep_volumes import (
     ImagePoses,
     Places,
@@ -27,6 +26,7 @@ from rehearsal.reconstruction.sweep_volumes import (
     image_poses_of,
     lit_pixels,
     reconstruct_volumes,
+    with_errors,
 )
 from rehearsal.result_files import write_json
 from scenes.anatomy import LoadedAnatomy

@@ -165,13 +165,15 @@ class LiveMeasurements:
 
     def _show(self) -> None:
         """Update what the window shows."""
-        surfaces = {"organ": self.anatomy.organ, "tumour": self.anatomy.tumour}
-        self._seen = {
-            name: self.coverage.is_seen(np.asarray(surface.vertices))
-            for name, surface in surfaces.items()
-            if surface is not None
-        }
+        self._seen = {name: self.coverage.is_seen(points) for name, points in self._vertices().items()}
         self._findings = self.findings()
+
+    def _vertices(self) -> dict[str, np.ndarray]:
+        """The vertices at rest (n, 3) [mm] of the surfaces on which the coverage is shown."""
+        surfaces = {"organ": self.anatomy.organ, "tumour": self.anatomy.tumour}
+        return {
+            name: np.asarray(surface.vertices) for name, surface in surfaces.items() if surface is not None
+        }
 
     def figures(self) -> dict[str, Any]:
         """The latest measurement and the coverage so far, rounded, for the record."""
@@ -215,38 +217,42 @@ class LiveMeasurements:
 
     def _shown_coverage(self) -> dict[str, np.ndarray]:
         """What was imaged of each surface, unless a cut has changed the surface since."""
-        surfaces = {"organ": self.anatomy.organ, "tumour": self.anatomy.tumour}
-        counts = {name: len(each.vertices) for name, each in surfaces.items() if each is not None}
-        return {name: seen for name, seen in self._seen.items() if counts.get(name) == len(seen)}
+        vertices = self._vertices()
+        return {name: seen for name, seen in self._seen.items() if len(vertices.get(name, ())) == len(seen)}
 
     def findings(self) -> dict[str, str]:
         """Name -> figure with its unit."""
         if self.anatomy.judgement is not None:
             return findings_of(self.anatomy.judgement)
-        found, plan = self._tissue_findings(), self.guide.figures() if self.guide is not None else {}
+        findings, plan = self._tissue_findings(), self.guide.figures() if self.guide is not None else {}
         if plan:
             off_mm, off_deg = plan["plan_off_mm"], plan["plan_off_deg"]
-            found["plan"] = f"{100 * (plan['plan_followed'] or 0.0):.0f} %"
-            found["off plan"] = "" if off_mm is None else f"{off_mm:.1f} mm {off_deg:.0f} deg"
-        return found
+            findings["plan"] = f"{100 * (plan['plan_followed'] or 0.0):.0f} %"
+            findings["off plan"] = "" if off_mm is None else f"{off_mm:.1f} mm {off_deg:.0f} deg"
+        return findings
 
     def _tissue_findings(self) -> dict[str, str]:
         latest = self.latest
         if latest is None:
             return {}
-        found = {COMPRESSION: _mm(latest.compression_mm), "contact": f"{latest.contact_mm2:.0f} mm2"}
+        findings = {
+            COMPRESSION: f"{_rounded(latest.compression_mm, 1)} mm",
+            "contact": f"{latest.contact_mm2:.0f} mm2",
+        }
         if latest.force_n is not None:
-            found["force"] = self._with_band("force_n", latest.force_n, "N", 2)
+            findings["force"] = self._with_band("force_n", latest.force_n, "N", 2)
         if latest.to_tumour_mm is None:
-            return found if self.anatomy.scanner is None else found | {"organ seen": self._share("organ")}
-        found |= {
+            if self.anatomy.scanner is not None:
+                findings["organ seen"] = self._share("organ")
+            return findings
+        findings |= {
             "to tumour": self._with_band("to_tumour_mm", latest.to_tumour_mm),
             "tumour depth": self._with_band("tumour_depth_mm", latest.tumour_depth_mm),
             "tumour shift": self._with_band("tumour_shift_mm", latest.tumour_shift_mm),
             "in view": "not cut" if latest.in_view is None else f"{100 * latest.in_view:.0f} %",
             "margin": self._with_band("margin_mm", latest.margin_mm) if latest.in_view else "",
         }
-        return found | {
+        return findings | {
             "tumour volume seen": self._share("tumour"),
             f"+{self.margin_mm:.0f} mm seen": self._share("margin"),
         }
@@ -261,16 +267,11 @@ class LiveMeasurements:
         if band is None:
             return f"{_rounded(value, digits)} {unit}"
         # Of these only a margin can be negative.
-        low, high = band if name == "margin_mm" else (max(each, 0.0) for each in band)
+        low, high = band if name == "margin_mm" else (max(limit, 0.0) for limit in band)
         return f"{_rounded(value, digits)} ({_rounded(low, digits)} to {_rounded(high, digits)}) {unit}"
 
     def _share(self, target: str) -> str:
         return f"{100 * self.coverage.fraction(target):.0f} %"
-
-
-def _mm(length: float) -> str:
-    """A length as the window shows it."""
-    return f"{_rounded(length, 1)} mm"
 
 
 def _rounded(value: float, digits: int) -> str:
@@ -280,7 +281,7 @@ def _rounded(value: float, digits: int) -> str:
 
 def _recorded_measurement(values: dict[str, float | None]) -> Measurement:
     """A measurement of a session's file. Raises SessionError."""
-    known = {each.name: values.get(each.name) for each in fields(Measurement)}
+    known = {figure.name: values.get(figure.name) for figure in fields(Measurement)}
     if known["compression_mm"] is None or known["contact_mm2"] is None:
         raise SessionError("the session holds a measurement without compression or contact: it is damaged")
     return Measurement(**known)  # type: ignore[arg-type]

@@ -130,7 +130,7 @@ def summary(report: dict) -> str:
 
 def _parts(parts: dict[str, dict[str, float]]) -> str:
     return ", ".join(
-        f"{name} {each['young_kpa']:g} kPa (nu {each['poisson']:g})" for name, each in parts.items()
+        f"{name} {part['young_kpa']:g} kPa (nu {part['poisson']:g})" for name, part in parts.items()
     )
 
 

@@ -74,10 +74,6 @@ def _rounded(value: float | None) -> float | None:
     return None if value is None else round(float(value), 3)
 
 
-def _force(most_n: float | None) -> list[str]:
-    return [] if most_n is None else [f"force       {most_n:.2f} N at most on the probe"]
-
-
 def summary_text(summary: dict[str, Any]) -> str:
     """A summary for the terminal."""
     seen = ", ".join(
@@ -85,7 +81,7 @@ def summary_text(summary: dict[str, Any]) -> str:
         for name, value in summary.items()
         if name.startswith("seen_")
     )
-    gaps = summary["gaps"]
+    gaps, force_n = summary["gaps"], summary["force_max_n"]
     largest = ""
     if gaps:
         volume_ml, thickness_mm = gaps[0]["volume_ml"], gaps[0]["thickness_mm"]
@@ -98,7 +94,7 @@ def summary_text(summary: dict[str, Any]) -> str:
             f"{counted(summary['bookmarks'], 'bookmark')}",
             f"compression {summary['compression_max_mm']:.1f} mm at most, also by the organ's own weight; "
             f"{summary['over_warning_s']:.1f} s above the limit of {summary['compression_warning_mm']:g} mm",
-            *_force(summary["force_max_n"]),
+            *([] if force_n is None else [f"force       {force_n:.2f} N at most on the probe"]),
             f"coverage    {f'of the volume: {seen}' if seen else 'none: there is no CT'}{largest}",
         ]
     )

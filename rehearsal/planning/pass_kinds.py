@@ -108,27 +108,27 @@ class PassKind:
         parameters.
         """
         middle = {name: (low + high) / 2 for name, (_, _, low, high) in RANGES[self.motion].items()}
-        found = []
+        rows = []
         for heading in (0.0, 90.0):
             across, count = max(self.extent_mm(heading)[0], LEAST_MM), self.needed(heading)
             for number in (count, count + 1):
                 apart = min(self.width_mm / across, 2 / number)
                 for aside in apart * (np.arange(number) - (number - 1) / 2):
                     own = dict(heading_deg=heading, aside=float(aside), lean_deg=0.0, lean_aside_deg=0.0)
-                    found.append(self.scaled(middle | own | ({"follow": 0.0} if "follow" in middle else {})))
-        return found
+                    rows.append(self.scaled(middle | own | ({"follow": 0.0} if "follow" in middle else {})))
+        return rows
 
     def random(self, random: np.random.Generator, count: int) -> list[np.ndarray]:
         """Random parameters for the beginning of a search; half of the passes run backwards."""
         ranges = RANGES[self.motion]
         ends = ("start", "end") if self.motion == "slide" else ("first_deg", "last_deg")
-        found = []
+        beginnings = []
         for number in range(count):
             values = {name: random.uniform(low, high) for name, (_, _, low, high) in ranges.items()}
             if number % 2:
                 values[ends[0]], values[ends[1]] = values[ends[1]], values[ends[0]]
-            found.append(self.scaled(values))
-        return found
+            beginnings.append(self.scaled(values))
+        return beginnings
 
 
 def kinds_of(trial: Trial) -> list[PassKind]:
@@ -167,7 +167,7 @@ def nearest_side(trial: Trial) -> np.ndarray | None:
     there is none.
     """
     manipulator, press, centre = trial.manipulator, trial.case.press, trial.places.mean(axis=0)
-    least, found = np.inf, None
+    least, nearest = np.inf, None
     for outward in directions(DIRECTIONS):
         place = manipulator.ray_hit(centre + FAR_MM * outward, -outward)
         if outward @ -np.array(press.direction) < LEAST_COSINE or place is None:
@@ -177,8 +177,8 @@ def nearest_side(trial: Trial) -> np.ndarray | None:
             frame = frame_towards(centre, outward, np.array(press.lateral))
             pose = pose_over(manipulator, frame, 0.0, 0.0, 0.0, 1.0)
             if pose is not None and trial.reach(pose[None])[0]:
-                least, found = distance, outward
-    return found
+                least, nearest = distance, outward
+    return nearest
 
 
 def directions(count: int) -> np.ndarray:

@@ -23,10 +23,10 @@ class PassPool:
 
     def __init__(self, passes: Sequence[TriedPass]) -> None:
         weight = {name: points for name, (points, *_) in WORDING.items()}
-        self._seen = np.stack([each.seen for each in passes]).astype(np.float32)
-        self._means = np.stack([each.sums for each in passes]) @ [weight[name] for name in MEANS]
-        self._poses = np.array([each.poses for each in passes])
-        self._path = weight["path_mm"] * np.array([each.path_mm for each in passes])
+        self._seen = np.stack([one.seen for one in passes]).astype(np.float32)
+        self._means = np.stack([one.sums for one in passes]) @ [weight[name] for name in MEANS]
+        self._poses = np.array([one.poses for one in passes])
+        self._path = weight["path_mm"] * np.array([one.path_mm for one in passes])
         self._seen_points, self._transfer = (
             weight["seen"] / self._seen.shape[1],
             weight["path_mm"] * TRANSFER_MM,

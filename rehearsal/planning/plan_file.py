@@ -94,7 +94,7 @@ class PlannedSweep(_FileModel):
 
     def poses(self) -> list[np.ndarray]:
         """The poses (n, 4, 4) of each pass."""
-        return [np.array(each) for each in self.passes]
+        return [np.array(poses) for poses in self.passes]
 
 
 class Plan(_FileModel):
@@ -121,7 +121,7 @@ class Plan(_FileModel):
         return of_this_format(values, "nephron_plan")
 
 
-def write_plan(plan: Plan, path: Path) -> None:
+def write_plan(plan: BaseModel, path: Path) -> None:
     """Write a plan; the same plan gives the same bytes. Raises OSError."""
     with atomic_write(path) as partial:
         partial.write_text(json.dumps(plan.model_dump(mode="json"), indent=1) + "\n", "utf-8")
@@ -132,10 +132,10 @@ def next_plan_path(folder: Path) -> Path:
     return folder / f"plan-{next_number(folder, NAME):03d}.json"
 
 
-def is_plan(path: Path) -> bool:
-    """Whether a file begins as a plan does."""
+def is_plan(path: Path, mark: str = MARK) -> bool:
+    """Whether a file begins as a plan does: with a ``mark``."""
     try:
-        return MARK in read_text(path)[:100]
+        return mark in read_text(path)[:100]
     except (OSError, TextError):
         return False
 
@@ -164,9 +164,9 @@ def timed_poses(sweep: PlannedSweep, speed_mm_s: float) -> TimedPoses:
     speeds: list[float] = []
     passes = sweep.poses()
     before = [np.array([_lifted(passes[0][0])]), *map(np.array, sweep.transfers)]
-    for way, each in zip(before, passes, strict=True):
-        poses += [*way, *each]
-        speeds += [*(LIFTED_MM_S for _ in way), *(speed_mm_s for _ in each)]
+    for way, one_pass in zip(before, passes, strict=True):
+        poses += [*way, *one_pass]
+        speeds += [*(LIFTED_MM_S for _ in way), *(speed_mm_s for _ in one_pass)]
     poses.append(_lifted(passes[-1][-1]))
     speeds.append(LIFTED_MM_S)
     durations = [_length_mm(a, b) / speed for (a, b), speed in zip(pairwise(poses), speeds[1:], strict=True)]

@@ -5,6 +5,7 @@ Both stages are an evolution strategy (Beyer & Schwefel 2002, "Evolution strateg
 introduction"): the best set of the passes tried so far is varied by random changes.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -24,8 +25,7 @@ from rehearsal.planning.sweep_score import (
     score,
     why_better,
 )
-from rehearsal.planning.sweep_trial import TRIAL_MM_S, Trial
-from rehearsal.planning.trial_workers import Trials
+from rehearsal.planning.sweep_trial import TRIAL_MM_S, Trial, Trials
 from version import VERSION
 
 SEED = 20161130
@@ -71,19 +71,17 @@ class PassSearch:
         """Parameters of the best set's passes with random changes: of each pass a large one, then a small
         one.
         """
-        found = []
+        variations = []
         for number in range(count if self.best else 0):
             times, which = divmod(number, len(self.best))
-            sigma = self.sigma / (1 + times % 2)
             parameters = self.best[which].parameters
-            found.append(
-                np.clip(parameters + sigma * self._random.standard_normal(parameters.shape), 0.0, 1.0)
-            )
-        return found
+            change = self.sigma / (1 + times % 2) * self._random.standard_normal(parameters.shape)
+            variations.append(np.clip(parameters + change, 0.0, 1.0))
+        return variations
 
     def add(self, passes: Sequence[TriedPass | None]) -> None:
         """Add tried passes; None is one that the instrument cannot hold."""
-        self.tried += [each for each in passes if each is not None]
+        self.tried += [tried for tried in passes if tried is not None]
         self.best = best_selection(self.tried, self.kind.most_passes)
 
 
@@ -101,9 +99,9 @@ def search_space(trial: Trial) -> tuple[list[PassKind], dict[str, float | int | 
 def surrogate_search(trial: Trial, kind: PassKind) -> list[TriedPass]:
     """The best set of passes of a kind on the rigid surrogate."""
     surrogate, search = RigidSurrogate(trial), PassSearch(kind, SURROGATE_SIGMA)
-    search.add([surrogate.try_pass(kind, each) for each in search.first(BEGINNING)])
+    search.add([surrogate.try_pass(kind, parameters) for parameters in search.first(BEGINNING)])
     for _ in range(ROUNDS):
-        search.add([surrogate.try_pass(kind, each) for each in search.variations(VARIATIONS)])
+        search.add([surrogate.try_pass(kind, parameters) for parameters in search.variations(VARIATIONS)])
     return search.best
 
 
@@ -133,12 +131,12 @@ def _placed(trial: Trial, ways: list[np.ndarray]) -> list[np.ndarray]:
 def _in_order(trial: Trial, kind: PassKind, parameters: list[np.ndarray]) -> list[np.ndarray]:
     """The passes, each the one that begins nearest to the end of the one before."""
     manipulator = trial.manipulator
-    poses = [kind.poses(manipulator, kind.values(each)) for each in parameters]
-    left = [each for each in poses if each is not None]
+    passes = [kind.poses(manipulator, kind.values(values)) for values in parameters]
+    left = [poses for poses in passes if poses is not None]
     ordered = [left.pop(0)]
     while left:
         end = face_centres(manipulator, ordered[-1][-1:])[0]
-        begins = np.stack([face_centres(manipulator, each[:1])[0] for each in left])
+        begins = np.stack([face_centres(manipulator, poses[:1])[0] for poses in left])
         ordered.append(left.pop(int(np.linalg.norm(begins - end, axis=1).argmin())))
     return ordered
 
@@ -180,8 +178,8 @@ def make_plan(workers: Trials, speed_mm_s: float, trials: int, progress: Progres
             parts=_rounded(asdict(terms)),
             points=_rounded(points(terms)),
             trials=len(one.tried),
-            passes=[np.round(each, DIGITS).tolist() for each in passes],
-            transfers=[np.round(each, DIGITS).tolist() for each in transfers],
+            passes=[np.round(poses, DIGITS).tolist() for poses in passes],
+            transfers=[np.round(poses, DIGITS).tolist() for poses in transfers],
         )
         for one, terms, passes, transfers in rows
     ]
@@ -216,7 +214,7 @@ def search(kinds: list[PassKind], workers: Trials, trials: int, progress: Progre
             rough.append((kind, best))
     rough = sorted(rough, key=lambda each: -score_of(each[1]))[:MOST_SWEEPS]
     searches = [PassSearch(kind, TRIAL_SIGMA) for kind, _ in rough]
-    first = [[each.parameters for each in best] for _, best in rough]
+    first = [[tried.parameters for tried in best] for _, best in rough]
     trials -= _try(searches, first, workers, trials, progress)
     searches = sorted((one for one in searches if one.best), key=lambda one: -one.score)
     while searches and trials > 0:
@@ -233,23 +231,22 @@ def _try(
     progress: Progress,
 ) -> int:
     """Try passes for each search, at most so many in all; return how many were tried."""
-    tasks = [(one, each) for one, asked in zip(searches, parameters, strict=True) for each in asked][:most]
-    found: list[tuple[PassSearch, TriedPass | None]] = []
-    for (one, _), tried in zip(
-        tasks, workers.map(try_pass, [(o.kind, each) for o, each in tasks]), strict=True
-    ):
-        found.append((one, tried))
+    owners = [one for one, passes in zip(searches, parameters, strict=True) for _ in passes][:most]
+    tasks = zip([one.kind for one in owners], itertools.chain(*parameters), strict=False)
+    tried = []
+    for one_pass in workers.map(try_pass, list(tasks)):
+        tried.append(one_pass)
         progress(1)
     for one in searches:
-        one.add([tried for searched, tried in found if searched is one])
-    return len(tasks)
+        one.add([one_pass for one_pass, owner in zip(tried, owners, strict=True) if owner is one])
+    return len(tried)
 
 
 def ranked(
     searches: list[PassSearch], workers: Trials, speed_mm_s: float, progress: Progress
 ) -> list[tuple[PassSearch, ScoreTerms, list[np.ndarray], list[np.ndarray]]]:
     """The best set of each search as a sweep at the planned speed; highest score first."""
-    tasks = [(one.kind, [each.parameters for each in one.best], speed_mm_s) for one in searches]
+    tasks = [(one.kind, [tried.parameters for tried in one.best], speed_mm_s) for one in searches]
     rows = []
     for one, tried in zip(searches, workers.map(try_sweep, tasks), strict=True):
         rows.append((one, *tried))

@@ -15,8 +15,7 @@ from rehearsal.notices import Notices
 from rehearsal.planning.plan_file import Plan, PlanError, next_plan_path, write_plan
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plan_search import make_plan, total_work
-from rehearsal.planning.sweep_trial import PlanningProblem
-from rehearsal.planning.trial_workers import TrialWorkers
+from rehearsal.planning.sweep_trial import PlanningProblem, TrialWorkers
 from rehearsal.worker_processes import WorkerError, Workers
 from render.viewer import Controls, PlanSettings
 from scenes.anatomy import LoadedAnatomy

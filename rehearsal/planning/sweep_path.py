@@ -1,4 +1,5 @@
-"""Paths of the probe over the settled organ: parallel passes, in each of which the probe slides or tilts.
+"""Paths of the probe over the settled organ: parallel passes, in each of which the probe slides or tilts; and
+which of their poses an instrument through a trocar can hold.
 
 A path is a list of passes, each the poses (n, 4, 4) of a probe in contact; between passes the probe is
 lifted. A frame (4, 4) of ``frame_towards`` places the passes: x is across them, y along them, z away from the
@@ -6,10 +7,11 @@ organ, and its origin [mm] is their centre.
 """
 
 import numpy as np
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from rehearsal.planning.instrument_reach import clear_of_organ
 from rehearsal.planning.plan_file import LIFT_MM
+from scenes.scene import Trocar
 from ultrasound.probe_manipulator import (
     ProbeManipulator,
     advanced,
@@ -26,6 +28,8 @@ STEP_MM, STEP_DEG = 1.5, 2.0
 LIFTS_MM, WAY_MM, ARC_DEG = (LIFT_MM, 12.0, 24.0, 48.0, 96.0), 3.0, 15.0
 # Rays towards the organ's surface start this far outside [mm].
 FAR_MM = 300.0
+# Within this distance of the probe the shaft may touch the organ [mm].
+NEAR_MM = 2.0
 
 
 def frame_towards(centre: np.ndarray, outward: np.ndarray, lateral: np.ndarray) -> np.ndarray:
@@ -67,7 +71,7 @@ def sliding(
             else:
                 runs[-1].append(pose)
         passes.append(max(runs, key=len))
-    return [np.stack(each) for each in passes if len(each) > 1]
+    return [np.stack(run) for run in passes if len(run) > 1]
 
 
 def tilting(
@@ -87,7 +91,7 @@ def tilting(
         upright = pose_over(manipulator, frame, aside, ahead_mm, depth_mm, 1.0)
         if upright is not None:
             angles = np.linspace(*angles_deg, count)[:: (-1) ** number]
-            passes.append(np.stack([tilted(upright, manipulator.size_mm[2], each) for each in angles]))
+            passes.append(np.stack([tilted(upright, manipulator.size_mm[2], angle) for angle in angles]))
     return passes
 
 
@@ -103,7 +107,9 @@ def transfer(manipulator: ProbeManipulator, end: np.ndarray, start: np.ndarray) 
         ends = advanced(end, -lift), advanced(start, -lift)
         count = max(1, int(np.ceil(np.linalg.norm(ends[1][:3, 3] - ends[0][:3, 3]) / WAY_MM)))
         rising = [
-            advanced(pose, -each) for pose in (end, start) for each in np.arange(LIFTS_MM[0], lift, WAY_MM)
+            advanced(pose, -height)
+            for pose in (end, start)
+            for height in np.arange(LIFTS_MM[0], lift, WAY_MM)
         ]
         if clear_of_organ(manipulator, np.array([*rising, *poses_between(*ends, count)])).all():
             return np.array([*ends, above] if lift > LIFTS_MM[0] else ends)
@@ -156,11 +162,11 @@ def poses_over(
     places = above[over] - distance[over, None] * outward
     axes = (1 - follow) * outward + follow * manipulator.surface_normals(places)
     size, samples, radius = manipulator.size_mm, manipulator.samples, manipulator.radius_mm
-    found: list[np.ndarray | None] = [None] * len(above)
+    poses: list[np.ndarray | None] = [None] * len(above)
     for number, place, axis in zip(np.flatnonzero(over), places, axes, strict=True):
         pose = touching(pose_at(place, -axis, lateral, size[2]), size, samples, radius)
-        found[number] = advanced(pose, depth_mm)
-    return found
+        poses[number] = advanced(pose, depth_mm)
+    return poses
 
 
 def tilted(pose: np.ndarray, length_mm: float, angle_deg: float) -> np.ndarray:
@@ -170,3 +176,44 @@ def tilted(pose: np.ndarray, length_mm: float, angle_deg: float) -> np.ndarray:
     result[:3, :3] = pose[:3, :3] @ Rotation.from_euler("x", angle_deg, degrees=True).as_matrix()
     result[:3, 3] = face + length_mm / 2 * result[:3, 2]
     return result
+
+
+def reachable(
+    trocar: Trocar, manipulator: ProbeManipulator, origin: np.ndarray, target: np.ndarray, poses: np.ndarray
+) -> np.ndarray:
+    """Which poses (n, 4, 4) over the settled organ are reachable, bool (n,); all are without a trocar.
+
+    ``origin`` (3,) is the rehearsal's origin in the patient [mm]. The shaft is straight, from the trocar to
+    the centre of the probe's back. Without an axis of its own, the trocar's cone is about the direction to
+    ``target`` (3,).
+    """
+    if trocar.at_mm is None:
+        return np.ones(len(poses), bool)
+    at = np.array(trocar.at_mm) - origin
+    axis = target - at if trocar.axis is None else np.array(trocar.axis)
+    axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
+    shafts = poses[:, :3, 3] + manipulator.size_mm[2] / 2 * poses[:, :3, 2] - at
+    length = np.linalg.norm(shafts, axis=1)
+    along = shafts / np.maximum(length, 1e-9)[:, None]
+    can = (length <= trocar.longest_mm) & _within(along @ axis, trocar.cone_deg)
+    can &= _within(-np.einsum("ij,ij->i", along, poses[:, :3, 2]), trocar.wrist_deg)
+    free = manipulator.ray_distances(np.repeat(at[None], can.sum(), axis=0), along[can])
+    can[can] = free > length[can] - NEAR_MM
+    return can
+
+
+def clear_of_organ(manipulator: ProbeManipulator, poses: np.ndarray) -> np.ndarray:
+    """Whether the probe is outside the settled organ at each of the poses (n, 4, 4), bool (n,)."""
+    half = manipulator.size_mm / 2
+    samples = manipulator.samples
+    clear = np.ones(len(poses), bool)
+    # Few poses are so near that a point of the surface may be in the probe.
+    least = cdist(poses[:, :3, 3], samples, "sqeuclidean").min(axis=1)
+    for number in np.flatnonzero(least < half @ half):
+        local = (samples - poses[number, :3, 3]) @ poses[number, :3, :3]
+        clear[number] = not (np.abs(local) < half).all(axis=1).any()
+    return clear
+
+
+def _within(cosine: np.ndarray, most_deg: float) -> np.ndarray:
+    return cosine >= np.cos(np.radians(most_deg)) - 1e-9

@@ -85,10 +85,10 @@ def incidence_deg(manipulator: ProbeManipulator, poses: np.ndarray) -> float:
 
 def points(terms: ScoreTerms) -> dict[str, float]:
     """The points of each term, by name."""
-    found = {name: weight * getattr(terms, name) for name, (weight, *_) in WORDING.items()}
+    by_name = {name: weight * getattr(terms, name) for name, (weight, *_) in WORDING.items()}
     if terms.reachable < 1.0:
-        found["reachable"] = UNREACHABLE * (1.0 + (1.0 - terms.reachable))
-    return found
+        by_name["reachable"] = UNREACHABLE * (1.0 + (1.0 - terms.reachable))
+    return by_name
 
 
 def score(terms: ScoreTerms) -> float:

@@ -1,18 +1,22 @@
-"""A trial of a sweep on the deforming organ, as the transducer would be driven: its score terms."""
+"""Trials of sweeps on the deforming organ, as the transducer would be driven: their score terms; in this
+process or on workers, with the same results.
+"""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
+from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
 from rehearsal.case import case_of
-from rehearsal.planning.instrument_reach import clear_of_organ, reachable
 from rehearsal.planning.plan_file import DEG_PER_MM, LIFT_MM, LIFTED_MM_S, PlanError
-from rehearsal.planning.sweep_path import LIFTS_MM, transfer
+from rehearsal.planning.sweep_path import LIFTS_MM, clear_of_organ, reachable, transfer
 from rehearsal.planning.sweep_score import MEANS, ScoreTerms, TriedPass, face_centres, incidence_deg, path_mm
 from rehearsal.rehearsal import Rehearsal
+from rehearsal.worker_processes import Workers, built_once
 from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import Scene, Trocar
 from ultrasound.array_contact import measure_contact
@@ -104,9 +108,7 @@ class Trial:
         """The terms of the measurements since the begin, at the poses of these passes."""
         return self.terms(
             passes,
-            self._compressions,
-            self._contacts,
-            np.array(self._restored),
+            *self._measured(),
             seen=self.coverage.fraction(self.target),
             path_mm=self._path_mm,
             time_s=self._steps_taken * self.rehearsal.organ.settings.time_step_s,
@@ -144,9 +146,7 @@ class Trial:
         self.move(self.rehearsal.organ.pose, poses[0])
         self._follow(poses)
         seen = self.coverage.seen[self.coverage.targets[self.target]][self._sampled]
-        return self.tried(
-            parameters, poses, seen, self._compressions, self._contacts, np.array(self._restored)
-        )
+        return self.tried(parameters, poses, seen, *self._measured())
 
     def tried(
         self,
@@ -171,7 +171,7 @@ class Trial:
         from both ends of each pass.
         """
         # In a hollow of the organ it would meet another part of it.
-        lifted = [advanced(pose, -lift) for each in passes for pose in each[[0, -1]] for lift in LIFTS_MM]
+        lifted = [advanced(pose, -lift) for poses in passes for pose in poses[[0, -1]] for lift in LIFTS_MM]
         clear = clear_of_organ(self.manipulator, np.array(lifted))
         return np.concatenate([self.reach(np.concatenate(passes)), clear])
 
@@ -184,6 +184,10 @@ class Trial:
         self._restored: list[bool] = []
         self._was_restored = False
         self._path_mm, self._steps_taken, self._speed_mm_s = 0.0, 0, speed_mm_s
+
+    def _measured(self) -> tuple[list[float], list[float], np.ndarray]:
+        """Compression [mm] and contact at each pose, and whether a state was restored before it (n,)."""
+        return self._compressions, self._contacts, np.array(self._restored)
 
     def _follow(self, poses: np.ndarray) -> None:
         """From the first pose, where the probe is, to the last, with measurements at each."""
@@ -239,3 +243,36 @@ class Trial:
         self._contacts.append(float(touches.mean()))
         self._restored.append(self._was_restored)
         self._was_restored = False
+
+
+class TrialWorkers:
+    """Workers with a trial of one problem each."""
+
+    def __init__(self, problem: PlanningProblem, workers: Workers) -> None:
+        self.problem, self._workers = problem, workers
+        self._key, self._sent = uuid4().hex, workers.share(problem.without_images)
+
+    def map(self, function: Callable, tasks: Sequence[tuple]) -> Iterator[Any]:
+        """The results of ``function(trial, *task)`` in the order of the tasks, each as soon as it is there.
+
+        Raises WorkerError.
+        """
+        return self._workers.map(_call, ((self._key, self._sent, function, *task) for task in tasks))
+
+
+class TrialHere:
+    """The one trial of this process."""
+
+    def __init__(self, problem: PlanningProblem, trial: Trial) -> None:
+        self.problem, self._trial = problem, trial
+
+    def map(self, function: Callable, tasks: Sequence[tuple]) -> Iterator[Any]:
+        """As ``TrialWorkers.map``."""
+        return (function(self._trial, *task) for task in tasks)
+
+
+Trials = TrialWorkers | TrialHere
+
+
+def _call(key: str, problem: PlanningProblem, function: Callable, *task: object) -> Any:
+    return function(built_once(key, lambda: Trial(problem)), *task)

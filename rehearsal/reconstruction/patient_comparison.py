@@ -35,27 +35,27 @@ class SegmentationMetrics:
     centroid_mm: float
 
 
-def segmentation_metrics(found: np.ndarray, truth: np.ndarray, spacing_mm: float) -> SegmentationMetrics:
+def segmentation_metrics(region: np.ndarray, truth: np.ndarray, spacing_mm: float) -> SegmentationMetrics:
     """Compare two regions (x, y, z) bool on one grid of cubic voxels.
 
     Raises ValueError where the grids differ, or where the truth is empty.
     """
-    found, truth = np.asarray(found, bool), np.asarray(truth, bool)
-    if found.shape != truth.shape:
-        raise ValueError(f"regions are on grids of {found.shape} and {truth.shape} voxels")
+    region, truth = np.asarray(region, bool), np.asarray(truth, bool)
+    if region.shape != truth.shape:
+        raise ValueError(f"regions are on grids of {region.shape} and {truth.shape} voxels")
     if not truth.any():
         raise ValueError("the true region is empty")
-    if not found.any():
+    if not region.any():
         return SegmentationMetrics(0.0, math.nan, -100.0, math.nan)
     # The bounding box of both: distances do not change.
-    both = ndimage.find_objects((found | truth).astype(np.uint8))[0]
-    found, truth = found[both], truth[both]
-    shared, count, true_count = (int(np.count_nonzero(a)) for a in (found & truth, found, truth))
+    both = ndimage.find_objects((region | truth).astype(np.uint8))[0]
+    region, truth = region[both], truth[both]
+    shared, count, true_count = (int(np.count_nonzero(a)) for a in (region & truth, region, truth))
     return SegmentationMetrics(
         dice=2 * shared / (count + true_count),
-        hd95_mm=spacing_mm * max(_distance95(found, truth), _distance95(truth, found)),
+        hd95_mm=spacing_mm * max(_distance95(region, truth), _distance95(truth, region)),
         volume_percent=100 * (count / true_count - 1),
-        centroid_mm=spacing_mm * float(np.linalg.norm(_centroid(found) - _centroid(truth))),
+        centroid_mm=spacing_mm * math.dist(ndimage.center_of_mass(region), ndimage.center_of_mass(truth)),
     )
 
 
@@ -67,10 +67,6 @@ def _distance95(region: np.ndarray, other: np.ndarray) -> float:
 
 def _surface(region: np.ndarray) -> np.ndarray:
     return region & ~ndimage.binary_erosion(region)
-
-
-def _centroid(region: np.ndarray) -> np.ndarray:
-    return np.argwhere(region).mean(axis=0)
 
 
 def surfaces_of(anatomy: LoadedAnatomy) -> dict[str, trimesh.Trimesh]:
@@ -119,7 +115,7 @@ def compare_with_surfaces(
     """Segmentation metrics of each region, for the whole surface and for the scanned part; landmark errors
     of beads (n, 3) [mm].
     """
-    found: dict[str, Any] = {}
+    comparison: dict[str, Any] = {}
     for name, surface in surfaces.items():
         if name not in volumes.regions:
             continue
@@ -133,20 +129,20 @@ def compare_with_surfaces(
         scanned = truth & enclosed.known
         whole = segmentation_metrics(region, truth, spacing)
         part = segmentation_metrics(region & enclosed.known, scanned, spacing) if scanned.any() else None
-        found[name] = dict(
+        comparison[name] = dict(
             scanned=float(scanned.sum() / truth.sum()),
             whole=_rounded(whole),
             scanned_part=None if part is None else _rounded(part),
         )
     if beads_mm is not None:
         errors = [float(np.linalg.norm(place - beads_mm[bead])) for bead, place in volumes.beads.items()]
-        found["landmarks"] = dict(
+        comparison["landmarks"] = dict(
             count=len(errors),
             of=len(beads_mm),
             mean_mm=float(np.mean(errors)) if errors else None,
             max_mm=float(np.max(errors)) if errors else None,
         )
-    return found
+    return comparison
 
 
 def _rounded(figures: SegmentationMetrics) -> dict[str, float | None]:

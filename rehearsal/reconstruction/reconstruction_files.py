@@ -34,7 +34,7 @@ def save_volume(voxels: np.ndarray, box: VoxelBox, path: Path) -> None:
     Raises OSError.
     """
     image = sitk.GetImageFromArray(np.ascontiguousarray(voxels.transpose(2, 1, 0)))
-    image.SetOrigin([float(each) for each in box.origin_mm])
+    image.SetOrigin([float(coordinate) for coordinate in box.origin_mm])
     image.SetSpacing([box.spacing_mm] * 3)
     save_image(image, path)
 

@@ -1,14 +1,17 @@
-"""Volumes of a tracked sweep: grey values, and, from ground-truth labels, organ, tumour and beads."""
+"""Volumes of a tracked sweep: grey values, and, from ground-truth labels, organ, tumour and beads; of its own
+poses, or with the errors of a simulated tracker.
+"""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.ndimage import binary_erosion, find_objects
 
 from scenes.terminal import Progress, silent
 from ultrasound.reconstruction import Reconstruction, VoxelBox
-from ultrasound.sweep import PixelLabel, Sweep, SweepError
+from ultrasound.sweep import PixelLabel, Sweep, SweepError, transform_fields
+from ultrasound.tracking_errors import TrackingErrors, with_tracking_errors
 
 GREY = "grey"
 # A voxel belongs to a region from this fraction of its pixels.
@@ -47,13 +50,41 @@ class SweepVolumes:
 
 def image_poses_of(sweep: Sweep, reference: str) -> ImagePoses:
     """The poses of a sweep's images in a coordinate system. Raises SweepError where no image has one."""
-    found = [(k, sweep.transform("Image", reference, k)) for k in range(len(sweep)) if sweep.is_image_ok(k)]
-    usable = [(k, matrix) for k, matrix in found if matrix is not None]
+    poses = {frame: sweep.transform("Image", reference, frame) for frame in range(len(sweep))}
+    usable = {frame: pose for frame, pose in poses.items() if pose is not None and sweep.is_image_ok(frame)}
     if not usable:
         raise SweepError(
             f"no image with a valid pose in {reference}, of {len(sweep)} frames: expected status OK in some"
         )
-    return ImagePoses(np.array([k for k, _ in usable]), np.stack([matrix for _, matrix in usable]))
+    return ImagePoses(np.array(list(usable)), np.stack(list(usable.values())))
+
+
+def with_errors(sweep: Sweep, reference: str, errors: TrackingErrors, seed: int) -> Sweep:
+    """The sweep with a tracker's errors on the poses of its probe; frames without a pose keep none.
+
+    Raises SweepError where poses or times cannot be used.
+    """
+    poses = [sweep.transform("Probe", reference, frame) for frame in range(len(sweep))]
+    known = [frame for frame, pose in enumerate(poses) if pose is not None]
+    if not known:
+        raise SweepError(f"no frame has a pose of the probe in {reference}, to which errors could be added")
+    try:
+        true_poses = np.stack([pose for pose in poses if pose is not None])
+        disturbed = with_tracking_errors(true_poses, sweep.times_s[known], errors, seed)
+    except ValueError as error:
+        raise SweepError(f"errors of a tracker cannot be added to this sweep: {error}") from None
+    name, frames = f"ProbeTo{reference}", [dict(fields) for fields in sweep.frames]
+    for frame, pose in zip(known, disturbed, strict=True):
+        frames[frame] |= transform_fields(name, pose)
+    after = replace(sweep, frames=frames)
+    first, pose = next(
+        ((frame, pose) for frame, pose in zip(known, disturbed, strict=True) if pose is not None), (0, None)
+    )
+    if pose is not None and not np.array_equal(pose, after.transform("Probe", reference, first)):  # type: ignore[arg-type]
+        raise SweepError(
+            f"the sweep holds {reference}ToProbe, to which no errors can be added: expected {name}Transform"
+        )
+    return after
 
 
 def lit_pixels(images: np.ndarray) -> np.ndarray:

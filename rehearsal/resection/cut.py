@@ -129,7 +129,7 @@ def check_hilum(cut: Cut, organ: trimesh.Trimesh, hilum: trimesh.Trimesh | None)
     if hilum is None:
         return
     around = solid_of(hilum, "hilum")
-    removed, whole = ((solid_of(each, "organ") ^ around).volume() for each in (cut.specimen, organ))
+    removed, whole = ((solid_of(surface, "organ") ^ around).volume() for surface in (cut.specimen, organ))
     if removed > MOST_OF_HILUM * whole:
         raise ResectionError(
             f"the cut removes {removed / whole:.0%} of the tissue around the hilum, where the kidney's "
@@ -201,7 +201,9 @@ def _bulge(enclosed: np.ndarray, outline: manifold3d.CrossSection) -> np.ndarray
 
 def _outline(polygons: Iterable[np.ndarray]) -> manifold3d.CrossSection:
     """The union of closed polygons (k, 3), seen along the third axis; either way round."""
-    sections = [manifold3d.CrossSection([each[:, :2]], manifold3d.FillRule.NonZero) for each in polygons]
+    sections = [
+        manifold3d.CrossSection([polygon[:, :2]], manifold3d.FillRule.NonZero) for polygon in polygons
+    ]
     return manifold3d.CrossSection.batch_boolean(sections, manifold3d.OpType.Add)
 
 
@@ -240,23 +242,25 @@ def grown(points: np.ndarray, by_mm: float) -> np.ndarray:
 
 def _ridge(rim: np.ndarray, height: float) -> np.ndarray:
     """The ends (2, 3) of a wedge's ridge at a height: as much shorter than the line as that is wide."""
-    half = np.ptp(rim[:, :2], axis=0) / 2
-    centre = rim[:, :2].min(axis=0) + half
-    length = max(half[0] - half[1], 0.0)
+    centre, length, _ = _roof(rim)
     return np.array([[centre[0] - length, centre[1], height], [centre[0] + length, centre[1], height]])
+
+
+def _roof(rim: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """The centre (2,) of a line's extent, half of the length of the ridge over it, and half of its width."""
+    half = np.ptp(rim[:, :2], axis=0) / 2
+    return rim[:, :2].min(axis=0) + half, max(half[0] - half[1], 0.0), max(half[1], 1e-6)
 
 
 def _ridge_height(rim: np.ndarray, around: np.ndarray) -> float:
     """The height of the ridge at which straight walls from the rim contain points (n, 3), as far as the
     rim is wide enough.
     """
-    half = np.ptp(rim[:, :2], axis=0) / 2
-    centre = rim[:, :2].min(axis=0) + half
-    length = max(half[0] - half[1], 0.0)
+    centre, length, half_width = _roof(rim)
     # Distance from the axis of the ridge, as a share of the rim's: at a depth d walls are at 1 - d / depth of
     # it.
     along = np.abs(around[:, 0] - centre[0])
-    aside = np.hypot(np.maximum(along - length, 0.0), around[:, 1] - centre[1]) / max(half[1], 1e-6)
+    aside = np.hypot(np.maximum(along - length, 0.0), around[:, 1] - centre[1]) / half_width
     depth = np.maximum(-around[:, 2], 0.0)
     needed = depth / np.maximum(1.0 - aside, 1e-6)
     return -float(min(needed.max(), STEEPEST * depth.max()))

@@ -101,19 +101,19 @@ class Judgement:
 
     def warnings(self) -> list[str]:
         """What a surgeon would want to know at once."""
-        found = []
+        warnings = []
         if self.margin.positive_mm2 > 0:
-            found.append(
+            warnings.append(
                 f"the cut goes through the tumour over {shown(self.margin.positive_mm2, 'mm2')}; "
                 f"{shown(self.tumour_left_ml, 'ml', 1)} of it left"
             )
         wide = [vessel for vessel in self.vessels or () if vessel.diameter_mm >= MAIN_VESSEL_MM]
         if wide:
-            found.append(
+            warnings.append(
                 f"the cut divides a {wide[0].tissue} of {wide[0].diameter_mm:.1f} mm, as wide as a main "
                 "vessel"
             )
-        return found
+        return warnings
 
     def report(self) -> dict:
         """The figures for ``report.json``."""
@@ -238,13 +238,13 @@ def divided_vessels(
     pairs = surface.face_adjacency[np.isin(surface.face_adjacency, inside).all(axis=1)]
     links = csr_array((np.ones(len(pairs)), pairs.T), shape=(len(area), len(area)))
     place = connected_components(links, directed=False)[1]
-    found = []
+    vessels_cut = []
     for number in np.unique(place[inside]):
         faces = inside[place[inside] == number]
         if area[faces].sum() >= LEAST_OPENED_MM2:
             diameter = diameter_of_section(middle[faces], area[faces])
-            found.append(DividedVessel(_vessel_at(middle[faces], labels, tissues), diameter))
-    return tuple(sorted(found, key=lambda vessel: -vessel.diameter_mm))
+            vessels_cut.append(DividedVessel(_vessel_at(middle[faces], labels, tissues), diameter))
+    return tuple(sorted(vessels_cut, key=lambda vessel: -vessel.diameter_mm))
 
 
 def diameter_of_section(middle: np.ndarray, area_mm2: np.ndarray) -> float:
@@ -287,7 +287,7 @@ def shown(value: float, unit: str, digits: int = 0) -> str:
 def findings_of(judgement: Judgement) -> dict[str, str]:
     """Name -> figure with its unit, of a cut, for the window."""
     margin, opened = judgement.margin, judgement.collecting_system_opened_mm2
-    found = {
+    findings = {
         "least margin": f"{margin.least_mm:.1f} mm",
         "positive margin": shown(margin.positive_mm2, "mm2"),
         "specimen": f"{judgement.specimen_ml:.1f} ml",
@@ -296,8 +296,8 @@ def findings_of(judgement: Judgement) -> dict[str, str]:
         "calyces opened": NOT_LABELLED if opened is None else f"{opened:.0f} mm2",
     }
     if judgement.vessels is None:
-        found["vessels cut"] = NOT_LABELLED
+        findings["vessels cut"] = NOT_LABELLED
     elif judgement.vessels:
         widest = judgement.vessels[0]
-        found["vessels cut"] = f"{len(judgement.vessels)}, {widest.tissue} {widest.diameter_mm:.1f} mm"
-    return found
+        findings["vessels cut"] = f"{len(judgement.vessels)}, {widest.tissue} {widest.diameter_mm:.1f} mm"
+    return findings

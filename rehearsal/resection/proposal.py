@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull
 from rehearsal.resection.cut import Cut, CutSettings, check_hilum, cut_organ, grown
 from rehearsal.resection.judgement import Carried, Judgement, judge
 from rehearsal.resection.score_line import ResectionError, ScoreLine, places_on, score_line
+from render.viewer import Technique
 from scenes.anatomy import Grid
 from scenes.solids import solid_of
 
@@ -130,7 +131,7 @@ def why_first(proposals: list[Proposal]) -> str:
     if len(proposals) < 2:
         return ""
     first, second = proposals[:2]
-    costs = [cost_terms(each.judgement, each.settings.margin_mm) for each in (first, second)]
+    costs = [cost_terms(proposal.judgement, proposal.settings.margin_mm) for proposal in (first, second)]
     differing = [
         f"{name} {a:.1f} points instead of {b:.1f}"
         for (name, a), b in zip(costs[0].items(), costs[1].values(), strict=True)
@@ -158,16 +159,13 @@ def propose(
     A cut that removes much of the tissue within ``hilum`` is none. Raises ResectionError where none can be
     made.
     """
-    settings = [CutSettings("enucleoresection", margin_mm), CutSettings("wedge", margin_mm)]
-    if margin_mm == 0:
-        settings = [CutSettings("enucleation", 0.0), *settings[1:]]
-    at_rest = Carried(*(np.asarray(each.vertices, float) for each in (organ, organ, organ, tumour)))
-    found = []
-    for each in settings:
-        beyond_mm = WEDGE_WIDER_MM if each.technique == "wedge" else 0.0
-        for line in _lines(organ, tumour, margin_mm + beyond_mm):
+    around_tumour: Technique = "enucleation" if margin_mm == 0 else "enucleoresection"
+    at_rest = Carried(*(np.asarray(surface.vertices, float) for surface in (organ, organ, organ, tumour)))
+    proposals = []
+    for technique, wider_mm in ((around_tumour, 0.0), ("wedge", WEDGE_WIDER_MM)):
+        for line in _lines(organ, tumour, margin_mm + wider_mm):
             try:
-                cut = cut_organ(organ, line, each, np.asarray(tumour.vertices))
+                cut = cut_organ(organ, line, CutSettings(technique, margin_mm), np.asarray(tumour.vertices))
                 check_hilum(cut, organ, hilum)
             except ResectionError:
                 continue
@@ -175,13 +173,13 @@ def propose(
                 at_rest, specimen=np.asarray(cut.specimen.vertices), remnant=np.asarray(cut.remnant.vertices)
             )
             judged = judge(cut, organ, tumour, parts, carried, labels, tissues)
-            found.append(Proposal(cut, judged))
-    if not found:
+            proposals.append(Proposal(cut, judged))
+    if not proposals:
         raise ResectionError(
             f"no cut with a margin of {margin_mm:g} mm around this tumour leaves most of the kidney and of "
             "its hilum; choose a smaller margin"
         )
-    return sorted(found, key=lambda proposal: proposal.cost_ml)
+    return sorted(proposals, key=lambda proposal: proposal.cost_ml)
 
 
 def _lines(organ: trimesh.Trimesh, tumour: trimesh.Trimesh, margin_mm: float) -> list[ScoreLine]:
@@ -189,7 +187,10 @@ def _lines(organ: trimesh.Trimesh, tumour: trimesh.Trimesh, margin_mm: float) ->
     it.
     """
     outward = places_on(organ, tumour.center_mass[None])[1][0]
-    starts = [outward, *(each for each in trimesh.creation.icosahedron().vertices if each @ outward > 0)]
+    starts = [
+        outward,
+        *(vertex for vertex in trimesh.creation.icosahedron().vertices if vertex @ outward > 0),
+    ]
     lines: list[ScoreLine] = []
     for start in starts:
         with contextlib.suppress(ResectionError):

@@ -27,7 +27,6 @@ from scenes.surfaces import signed_distance_from
 # Width of a letter of the compass, whose axes have length 1.
 LETTER = 0.35
 NAME = "resection"
-NOTHING_CUT = "nothing was cut, or there is no tumour to judge by"
 # Colours of the margin: in the tumour, then up to each limit, then beyond the last.
 COLOURS = ("#7a0016", "#e5383b", "#ef8a00", "#ffd60a", "#52b483")
 CAPSULE = "#d1caca"
@@ -48,12 +47,12 @@ def figures_of(
     """The figures of a cut, and how it was made; ``seen_percent`` of the tumour's surface was seen, None
     where no image was.
     """
-    asked = cut.settings
+    settings = cut.settings
     return dict(
-        technique=asked.technique,
-        margin_asked_mm=asked.margin_mm,
-        depth_mm=asked.depth_mm,
-        filling=asked.filling,
+        technique=settings.technique,
+        margin_asked_mm=settings.margin_mm,
+        depth_mm=settings.depth_mm,
+        filling=settings.filling,
         tumour_seen_percent=seen_percent,
         score_to_tumour_mm=round(float(distance_to_tumour(cut.line, tumour).min()), 2),
         **judgement.report(),
@@ -65,12 +64,18 @@ def report_of(anatomy: DeformedAnatomy, plan: ResectionPlan | None = None) -> di
 
     Raises ResectionError without a cut.
     """
-    cut, judgement, tumour = anatomy.cut, anatomy.judgement, anatomy.case.tumour
-    if cut is None or judgement is None or tumour is None:
-        raise ResectionError(NOTHING_CUT)
+    cut, judgement, tumour = _judged(anatomy)
     seen_percent = round(100 * seen_share(anatomy), 1)
     compared = {} if plan is None else dict(against_plan=plan.compared(judgement))
     return figures_of(cut, judgement, tumour, seen_percent) | compared
+
+
+def _judged(anatomy: DeformedAnatomy) -> tuple[Cut, Judgement, trimesh.Trimesh]:
+    """The cut of an anatomy, its judgement and the tumour. Raises ResectionError where one is missing."""
+    cut, judgement, tumour = anatomy.cut, anatomy.judgement, anatomy.case.tumour
+    if cut is None or judgement is None or tumour is None:
+        raise ResectionError("nothing was cut, or there is no tumour to judge by")
+    return cut, judgement, tumour
 
 
 def save_page(anatomy: DeformedAnatomy, report: dict[str, Any], out: Path) -> list[Path]:
@@ -78,9 +83,7 @@ def save_page(anatomy: DeformedAnatomy, report: dict[str, Any], out: Path) -> li
 
     Raises ResectionError, OSError.
     """
-    cut, judgement, tumour = anatomy.cut, anatomy.judgement, anatomy.case.tumour
-    if cut is None or judgement is None or tumour is None:
-        raise ResectionError(NOTHING_CUT)
+    cut, judgement, tumour = _judged(anatomy)
     page, figures = out / f"{NAME}.png", out / f"{NAME}.json"
     draw_page(cut, judgement, tumour, report, page, "Resection")
     write_json(report, figures)
@@ -201,10 +204,10 @@ def _draw_figures(figure: Figure, report: dict[str, Any]) -> float:
 
 def why_less(report: dict[str, Any]) -> list[tuple[str, str]]:
     """Why the least margin is below the one that was asked for, as a row; none where it is not."""
-    asked, line, seen = (
+    margin_mm, line, seen = (
         report[name] for name in ("margin_asked_mm", "score_to_tumour_mm", "tumour_seen_percent")
     )
-    if report["margin_min_mm"] >= asked - KEPT_WITHIN_MM:
+    if report["margin_min_mm"] >= margin_mm - KEPT_WITHIN_MM:
         return []
     reasons = []
     if report["depth_mm"] is not None:
@@ -213,7 +216,7 @@ def why_less(report: dict[str, Any]) -> list[tuple[str, str]]:
         reasons.append("an enucleation has no margin")
     elif seen is not None and seen < 100:
         reasons.append("kept only from the tumour surface seen")
-    if line < asked:
+    if line < margin_mm:
         reasons.append(f"the score is {line:.1f} mm from the tumour")
     if report["technique"] == "wedge":
         reasons.append("the walls of a wedge are straight")
@@ -225,7 +228,7 @@ def rows_of(report: dict[str, Any]) -> list[tuple[str, str]]:
     depth = "to the tumour's depth" if report["depth_mm"] is None else f"{report['depth_mm']:g} mm deep"
     seen = report["tumour_seen_percent"]
     opened, divided = report["collecting_system_opened_mm2"], report["vessels"]
-    vessels = [f"{each['tissue']} {each['diameter_mm']:.1f} mm" for each in divided or []]
+    vessels = [f"{vessel['tissue']} {vessel['diameter_mm']:.1f} mm" for vessel in divided or []]
     cut_vessels = ", ".join(vessels[:3]) + (f" and {len(vessels) - 3} more" if len(vessels) > 3 else "")
     below = ", ".join(f"{report[f'margin_below_{limit:g}_mm2']:.0f}" for limit in MARGIN_LIMITS_MM)
     limits = ", ".join(f"{limit:g}" for limit in MARGIN_LIMITS_MM)

@@ -3,7 +3,6 @@
 JSON; patient coordinates LPS, mm.
 """
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,11 +18,11 @@ from pydantic import (
 )
 
 from errors import UserError, explained
+from rehearsal.planning.plan_file import is_plan
 from rehearsal.resection.judgement import Judgement
 from rehearsal.resection.proposal import Proposal, cost_ml
-from rehearsal.resection.script import Number
+from rehearsal.resection.resection_state import Number
 from render.viewer import Technique
-from scenes.atomic_files import atomic_write
 from text_files import TextError, read_text
 from version import FORMAT, of_this_format
 
@@ -140,18 +139,9 @@ def planned_cut(proposal: Proposal, origin: np.ndarray) -> PlannedCut:
     )
 
 
-def write_resection_plan(plan: ResectionPlan, path: Path) -> None:
-    """Write a plan; the same plan gives the same bytes. Raises OSError."""
-    with atomic_write(path) as partial:
-        partial.write_text(json.dumps(plan.model_dump(mode="json"), indent=1) + "\n", "utf-8")
-
-
 def is_resection_plan(path: Path) -> bool:
     """Whether a file begins as a plan of a resection does."""
-    try:
-        return MARK in read_text(path)[:100]
-    except (OSError, TextError):
-        return False
+    return is_plan(path, MARK)
 
 
 def read_resection_plan(path: Path) -> ResectionPlan:

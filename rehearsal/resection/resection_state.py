@@ -1,16 +1,23 @@
-"""What was done of a resection: the marks of the score, and the cut.
+"""What was done of a resection: the marks of the score, and the cut; and what a file of poses has done at its
+times.
 
 Values alone, so that undo, sessions and replays can keep them.
 """
 
+from collections import deque
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.score_line import ResectionError
+from render.viewer import Technique
+from ultrasound.crater import Filling
 
+Number = Annotated[float, Field(ge=-1e5, le=1e5)]
 Point = tuple[float, float, float]
 MOST_MARKS = 200
 
@@ -65,3 +72,43 @@ class Resection:
 
 
 NO_RESECTION = Resection()
+
+
+class ScriptedCut(BaseModel):
+    """A cut in a file; see ``CutSettings``."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    technique: Technique = "enucleoresection"
+    margin_mm: float = Field(5.0, ge=0, le=20)
+    depth_mm: float | None = Field(None, gt=0, le=60)
+    filling: Filling = "fluid"
+
+    def settings(self) -> CutSettings:
+        """As settings of a cut."""
+        return CutSettings(**self.model_dump())
+
+
+@dataclass(frozen=True)
+class ScriptedAction:
+    """At a time [s]: marks of the score, at the edges in the image or at places (LPS, mm), or a cut."""
+
+    time_s: float
+    score: Literal["image"] | list[Point] | None = None
+    margin_mm: float = 5.0
+    cut: CutSettings | None = None
+
+
+class ResectionScript:
+    """Actions in the order of their times."""
+
+    def __init__(self, actions: list[ScriptedAction]) -> None:
+        self._actions = deque(sorted(actions, key=lambda action: action.time_s))
+
+    def is_due(self, time_s: float) -> bool:
+        """Whether there is an action at or before a time [s]."""
+        return bool(self._actions) and self._actions[0].time_s <= time_s + 1e-9
+
+    def next(self) -> ScriptedAction:
+        """The next action, which is no longer there afterwards."""
+        return self._actions.popleft()

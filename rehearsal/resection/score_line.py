@@ -1,12 +1,17 @@
-"""The score: marks on the organ's capsule at rest, joined to a closed line of shortest paths."""
+"""The score: marks on the organ's capsule at rest, joined to a closed line of shortest paths; and its file,
+which 3D Slicer reads: a closed curve of its markups, LPS, mm.
+"""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import igl
 import numpy as np
 import trimesh
 
 from errors import UserError
+from rehearsal.case import Case
+from rehearsal.result_files import write_json
 
 LEAST_MARKS = 3
 # Distance of neighbouring points of the line [mm].
@@ -18,6 +23,8 @@ CROSSED_MM = 0.2
 LEAST_SHARE = 0.02
 # A line that encloses less than this share of a circle of its length is folded.
 LEAST_ROUNDNESS = 0.02
+NAME = "score.mrk.json"
+SCHEMA = "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/markups-schema-v1.0.3.json#"
 
 
 class ResectionError(UserError):
@@ -177,3 +184,20 @@ def crosses_itself(polygon: np.ndarray) -> bool:
     apart = side(start) * side(end) < 0
     crossing = apart & apart.T
     return bool(crossing.any())
+
+
+def save_score(case: Case, line: ScoreLine, out: Path, prefix: str = "") -> Path:
+    """Write a score in the patient at rest (the CT); return the file. Raises OSError."""
+    points = (line.points + case.origin).round(4).tolist()
+    curve = dict(
+        type="ClosedCurve",
+        coordinateSystem="LPS",
+        coordinateUnits="mm",
+        controlPoints=[
+            dict(id=f"{number}", label=f"score-{number}", position=point, positionStatus="defined")
+            for number, point in enumerate(points, 1)
+        ],
+    )
+    path = out / f"{prefix}{NAME}"
+    write_json({"@schema": SCHEMA, "markups": [curve]}, path)
+    return path

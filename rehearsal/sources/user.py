@@ -28,9 +28,9 @@ from rehearsal.loop.frame import Applied, Frame, Refused
 from rehearsal.notices import Notices
 from rehearsal.resection.operation import IsSeen, cut_command, mark_under, marks_of_image, places_at_rest
 from rehearsal.resection.resection_plan import ResectionPlan
+from rehearsal.resection.resection_state import ResectionScript, ScriptedAction
 from rehearsal.resection.resection_view import cut_settings
 from rehearsal.resection.score_line import ResectionError
-from rehearsal.resection.script import ResectionScript, ScriptedAction
 from rehearsal.sources.tracker import TrackEnded, Tracker
 from render.viewer import Controls
 from settings import live_values

@@ -26,15 +26,15 @@ class LinkOptions(CommandOptions):
     """With --link: its port [18944]."""
 
 
-def open_link(asked: LinkOptions) -> "OpenIGTLinkServer | None":
+def open_link(options: LinkOptions) -> "OpenIGTLinkServer | None":
     """Open the server that the options describe; it closes when the command ends. Raises CommandError."""
-    if not asked.link:
-        for option in asked.set_by_user("link_host", "link_port", "link_leads"):
+    if not options.link:
+        for option in options.set_by_user("link_host", "link_port", "link_leads"):
             raise CommandError(f"{option}: the link is off; add --link, or leave {option} out")
         return None
     from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer
 
-    host, port = asked.link_host or HOST, asked.link_port or PORT
+    host, port = options.link_host or HOST, options.link_port or PORT
     try:
         server = OpenIGTLinkServer(host, port, click.echo)
     except (OSError, UnicodeError) as error:  # UnicodeError: a text that cannot be a host name
@@ -47,7 +47,7 @@ def open_link(asked: LinkOptions) -> "OpenIGTLinkServer | None":
     click.get_current_context().with_resource(server)
     click.echo(f"The link is open: OpenIGTLink on {host}, port {port}.")
     if not server.is_private:
-        steer = " and move the probe" if asked.link_leads else ""
+        steer = " and move the probe" if options.link_leads else ""
         click.echo(
             f"Warning: everyone who can reach this machine over the network can read the image{steer}."
         )

@@ -179,15 +179,15 @@ class OpenIGTLinkServer:
             writer.transport.abort()
             return
         self._clients += 1
-        both = [asyncio.create_task(each) for each in (self._send_to(writer), self._read_from(reader))]
+        both = [asyncio.create_task(self._send_to(writer)), asyncio.create_task(self._read_from(reader))]
         try:
             # asyncio prints a traceback for a client that ends cancelled.
             with suppress(asyncio.CancelledError):
                 await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
         finally:
             self._clients -= 1
-            for each in both:
-                each.cancel()
+            for task in both:
+                task.cancel()
             writer.transport.abort()
 
     def _warn_once(self, text: str) -> None:

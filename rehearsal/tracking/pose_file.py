@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from errors import UserError, explained
-from rehearsal.resection.script import Number, ScriptedAction, ScriptedCut
+from rehearsal.resection.resection_state import Number, ScriptedAction, ScriptedCut
 from text_files import TABLES, TextError, json_value, read_text, table_rows
 from ultrasound.probe_manipulator import interpolated
 
@@ -149,18 +149,18 @@ def load_timed_poses(path: Path) -> TimedPoses:
     Raises PoseError.
     """
     placed = _read(path)
-    for number, each in enumerate(placed, 1):
-        if each.time_s is None:
+    for number, pose in enumerate(placed, 1):
+        if pose.time_s is None:
             raise PoseError(
                 f"{path}: pose {number} has no time; expected time_s in JSON, or in CSV seconds and sixteen "
                 "numbers per line"
             )
-    times_s = np.array([each.time_s for each in placed])
-    actions = [each.action(times_s[0]) for each in placed]
+    times_s = np.array([pose.time_s for pose in placed])
+    actions = [pose.action(times_s[0]) for pose in placed]
     try:
         return TimedPoses(
             times_s,
-            [np.array(each.probe_to_patient) for each in placed],
+            [np.array(pose.probe_to_patient) for pose in placed],
             tuple(action for action in actions if action is not None),
         )
     except PoseError as error:

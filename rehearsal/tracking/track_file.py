@@ -54,10 +54,10 @@ def check_near(track: TimedPoses, organ: np.ndarray, path: Path) -> None:
 
 
 def _sweep_poses(path: Path, name: str) -> TimedPoses:
-    found = TRANSFORM_NAME.fullmatch(name)
-    if found is None:
+    match = TRANSFORM_NAME.fullmatch(name)
+    if match is None:
         raise SweepError(f"--track-from {name!r}: expected a transform's name such as {PROBE_IN_PATIENT}")
-    probe, patient = found.groups()
+    probe, patient = match.groups()
     sweep = read_sweep(path)
     try:
         poses = [sweep.transform(probe, patient, frame) for frame in range(len(sweep))]

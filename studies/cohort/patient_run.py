@@ -11,8 +11,7 @@ from rehearsal.measurements.run_report import Tally
 from rehearsal.measurements.tumour_measurements import measure
 from rehearsal.planning.plan_file import Plan, PlanError
 from rehearsal.planning.plan_search import make_plan
-from rehearsal.planning.sweep_trial import PlanningProblem, Trial
-from rehearsal.planning.trial_workers import TrialHere
+from rehearsal.planning.sweep_trial import PlanningProblem, Trial, TrialHere
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import rounded
 from rehearsal.worker_processes import built_once

@@ -16,8 +16,7 @@ from rehearsal.commands.command_line import load_patient
 from rehearsal.configuration import PRESETS, probe_of, scene_of
 from rehearsal.planning.plan_search import make_plan, total_work, try_path, work_at
 from rehearsal.planning.sweep_score import ScoreTerms, score
-from rehearsal.planning.sweep_trial import PlanningProblem, Trial
-from rehearsal.planning.trial_workers import TrialWorkers
+from rehearsal.planning.sweep_trial import PlanningProblem, Trial, TrialWorkers
 from rehearsal.worker_processes import Workers
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import EMBEDDED, Scene

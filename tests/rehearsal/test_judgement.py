@@ -1,6 +1,7 @@
 """The figures of cuts by planes and balls, whose margins, areas and volumes have closed forms."""
 
 import re
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
@@ -51,14 +52,14 @@ def judged(cut, tumour, parts=None, scale=(1.0, 1.0), **labels) -> Judgement:
     """The judgement of a cut, where the organ and the rest were larger by two factors when it was cut."""
     organ, others = scale
     surfaces = (cut.specimen, cut.remnant, tumour)
-    then = Carried(organ * ORGAN.vertices, *(others * each.vertices for each in surfaces))
+    then = Carried(organ * ORGAN.vertices, *(others * surface.vertices for surface in surfaces))
     return judge(cut, ORGAN, tumour, parts or {}, then, **labels)
 
 
 def test_the_margin_of_concentric_balls_is_the_difference_of_their_radii():
     specimen, tumour = ball(14.0), ball(9.0)
-    found = judged(cut_by(ORGAN, specimen), tumour)
-    margin = found.margin
+    judgement = judged(cut_by(ORGAN, specimen), tumour)
+    margin = judgement.margin
     # Both surfaces are inside their balls, by their own share at most.
     lost = 14 * inset(specimen)
     assert 5 - lost <= margin.margin_mm.min() and margin.margin_mm.max() <= 5 + 9 * inset(tumour)
@@ -68,7 +69,7 @@ def test_the_margin_of_concentric_balls_is_the_difference_of_their_radii():
     assert margin.area_below(5.5) == pytest.approx(area, rel=1e-9) and margin.area_below(4.5) == 0
     assert margin.middle.shape == (len(margin.area_mm2), 3)
     assert np.linalg.norm(margin.middle, axis=1) == pytest.approx(14.0, abs=lost)
-    report = found.report()
+    report = judgement.report()
     assert report["margin_below_3_mm2"] == 0 and report["margin_below_5_mm2"] <= round(area, 1)
     assert report["bed_mm2"] == round(area, 1) and report["positive_margin_mm2"] == 0
     assert report["specimen_ml"] == round(specimen.volume / 1000, 3)
@@ -86,20 +87,20 @@ def test_eccentric_balls_have_their_least_margin_on_one_side():
 @pytest.mark.parametrize("height", [-3.0, 0.0, 4.0])
 def test_a_plane_through_the_tumour_leaves_its_cap_and_a_positive_margin(height):
     tumour = ball(10.0)
-    found = judged(cut_by(ORGAN, half_space(height)), tumour)
+    judgement = judged(cut_by(ORGAN, half_space(height)), tumour)
     left = cap_mm3(10.0, 10.0 + height)
     small = 3 * inset(tumour)
-    assert found.tumour_left_ml == pytest.approx(left / 1000, rel=2 * small)
+    assert judgement.tumour_left_ml == pytest.approx(left / 1000, rel=2 * small)
     disc, whole = np.pi * (100 - height**2), np.pi * (R**2 - height**2)
     # A ring of faces at the border counts wholly or not.
     ring = 2 * np.pi * 10 * FACE_MM / 2
-    assert found.margin.area_below(0.0) == pytest.approx(disc, abs=ring + 2 * small * disc)
-    assert found.margin.area_mm2.sum() == pytest.approx(whole, rel=MESH)
-    assert found.margin.margin_mm.min() == 0.0
+    assert judgement.margin.area_below(0.0) == pytest.approx(disc, abs=ring + 2 * small * disc)
+    assert judgement.margin.area_mm2.sum() == pytest.approx(whole, rel=MESH)
+    assert judgement.margin.margin_mm.min() == 0.0
     # The mean of rho' - r beyond the disc, with rho' the distance from the middle of the ball.
     rim = R
     outer = (2 / 3 * np.pi * (rim**3 - 1000.0)) - 10 * np.pi * (rim**2 - 100.0)
-    assert found.margin.mean_mm == pytest.approx(outer / whole, rel=2 * MESH)
+    assert judgement.margin.mean_mm == pytest.approx(outer / whole, rel=2 * MESH)
 
 
 def test_specimen_and_parenchyma_are_what_is_above_the_plane():
@@ -107,33 +108,28 @@ def test_specimen_and_parenchyma_are_what_is_above_the_plane():
     tumour, urine = ball(6.0, (0.0, 0.0, 15.0)), ball(5.0, (0.0, 15.0, 6.0))
     sinus, cyst = ball(6.0, (0.0, -16.0, 4.0)), ball(4.0, (14.0, 0.0, 14.0))
     parts = dict(urine=urine, sinus=sinus, cyst=cyst, vessel=ball(3.0, (-14.0, 0.0, -8.0)))
-    found = judged(cut_by(ORGAN, half_space(6.0)), tumour, parts)
+    judgement = judged(cut_by(ORGAN, half_space(6.0)), tumour, parts)
     cap = cap_mm3(R, R - 6.0)
     removed = cap - tumour.volume - urine.volume / 2 - cap_mm3(6.0, 4.0) - cyst.volume
     whole = ORGAN.volume - tumour.volume - sum(part.volume for part in parts.values())
-    assert found.specimen_ml == pytest.approx(cap / 1000, rel=MESH)
-    assert found.parenchyma_removed_ml == pytest.approx(removed / 1000, rel=MESH)
-    assert found.parenchyma_removed_percent == pytest.approx(100 * removed / whole, rel=MESH)
+    assert judgement.specimen_ml == pytest.approx(cap / 1000, rel=MESH)
+    assert judgement.parenchyma_removed_ml == pytest.approx(removed / 1000, rel=MESH)
+    assert judgement.parenchyma_removed_percent == pytest.approx(100 * removed / whole, rel=MESH)
     disc = np.pi * 25
     ring = 2 * np.pi * 5 * FACE_MM / 2
-    assert found.collecting_system_opened_mm2 == pytest.approx(disc, abs=ring)
-    assert found.tumour_left_ml == 0
-
-
-def test_a_part_that_the_cut_does_not_reach_is_not_opened():
-    below = ball(5.0, (0.0, 0.0, -10.0))
-    cut, tumour = cut_by(ORGAN, half_space(6.0)), ball(6.0, (0.0, 0.0, 15.0))
-    found = judged(cut, tumour, dict(urine=below, vessel=below))
-    assert found.collecting_system_opened_mm2 == 0 and found.vessels == ()
-    assert "vessels cut" not in findings_of(found)
+    assert judgement.collecting_system_opened_mm2 == pytest.approx(disc, abs=ring)
+    assert judgement.tumour_left_ml == 0
+    # A part that the cut does not reach is not opened.
+    assert judgement.vessels == () and "vessels cut" not in findings_of(judgement)
+    assert _opened_mm2(cut_by(ORGAN, half_space(6.0)).resection_surface(), parts["vessel"]) == 0
 
 
 def test_what_is_not_labelled_is_not_said_to_be_whole():
-    found = judged(cut_by(ORGAN, half_space(6.0)), ball(6.0, (0.0, 0.0, 15.0)))
-    report, shown = found.report(), findings_of(found)
+    judgement = judged(cut_by(ORGAN, half_space(6.0)), ball(6.0, (0.0, 0.0, 15.0)))
+    report, shown = judgement.report(), findings_of(judgement)
     assert report["collecting_system_opened_mm2"] is report["vessels"] is None
     assert shown["calyces opened"] == shown["vessels cut"] == NOT_LABELLED
-    assert cost_ml(found, 0.0) == pytest.approx(found.parenchyma_removed_ml)
+    assert cost_ml(judgement, 0.0) == pytest.approx(judgement.parenchyma_removed_ml)
 
 
 def test_figures_as_cut_are_those_of_the_tissue_then():
@@ -141,10 +137,10 @@ def test_figures_as_cut_are_those_of_the_tissue_then():
     compare.
     """
     specimen, tumour = ball(14.0), ball(9.0)
-    found = judged(cut_by(ORGAN, specimen), tumour, scale=(1.1, 2.0))
-    assert found.margin_as_cut.margin_mm.min() == pytest.approx(10.0, abs=2 * 14 * inset(specimen))
-    assert found.margin.margin_mm.min() == pytest.approx(5.0, abs=14 * inset(specimen))
-    assert found.volume_change_percent == pytest.approx(100 * (2**3 / 1.1**3 - 1), rel=1e-6)
+    judgement = judged(cut_by(ORGAN, specimen), tumour, scale=(1.1, 2.0))
+    assert judgement.margin_as_cut.margin_mm.min() == pytest.approx(10.0, abs=2 * 14 * inset(specimen))
+    assert judgement.margin.margin_mm.min() == pytest.approx(5.0, abs=14 * inset(specimen))
+    assert judgement.volume_change_percent == pytest.approx(100 * (2**3 / 1.1**3 - 1), rel=1e-6)
 
 
 @pytest.mark.parametrize("tilt", [0, 30, 60])
@@ -152,14 +148,8 @@ def test_an_oblique_section_of_a_round_vessel_has_the_vessels_diameter(tilt):
     """A disc of 2 mm, seen along the vessel, is an ellipse with one axis longer by 1 / cos."""
     steps = 40
     radius, angle = np.meshgrid((np.arange(steps) + 0.5) / steps, 2 * np.pi * np.arange(steps) / steps)
-    long = 2.0 / np.cos(np.radians(tilt))
-    middle = np.column_stack(
-        [
-            long * (radius * np.cos(angle)).ravel(),
-            2.0 * (radius * np.sin(angle)).ravel(),
-            np.zeros(steps**2),
-        ]
-    )
+    disc = 2.0 * radius.ravel() * np.array([np.cos(angle).ravel(), np.sin(angle).ravel(), np.zeros(steps**2)])
+    middle = disc.T / [np.cos(np.radians(tilt)), 1.0, 1.0]
     turned = middle @ rotation_about([3, 1, 2], 40).T + [5.0, -3.0, 8.0]
     # The middle of each ring for its mean square: off by 1 / (2 n^2).
     assert diameter_of_section(turned, radius.ravel()) == pytest.approx(4.0, rel=1 / steps**2)
@@ -167,10 +157,10 @@ def test_an_oblique_section_of_a_round_vessel_has_the_vessels_diameter(tilt):
 
 def vessels() -> trimesh.Trimesh:
     """Two vessels across the plane z = 6: of 4 mm, oblique, and of 3 mm."""
-    wide = trimesh.creation.cylinder(2.0, 40.0, sections=64)
+    wide, narrow = (trimesh.creation.cylinder(radius, 40.0, sections=64) for radius in (2.0, 1.5))
     wide.apply_transform(trimesh.transformations.rotation_matrix(np.radians(40), [0, 1, 0]))
-    narrow = trimesh.creation.cylinder(1.5, 40.0, sections=64).apply_translation([0.0, 14.0, 0.0])
-    return trimesh.util.concatenate([wide.apply_translation([-5.0, -8.0, 6.0]), narrow])
+    wide.apply_translation([-5.0, -8.0, 6.0])
+    return trimesh.util.concatenate([wide, narrow.apply_translation([0.0, 14.0, 0.0])])
 
 
 def labelled() -> Grid:
@@ -188,45 +178,31 @@ def test_divided_vessels_are_named_by_the_labels_and_ordered_by_their_width():
     cut = cut_by(ORGAN, half_space(6.0))
     # Of the wide one, whose middle is at y = -8, a third is labelled as an artery.
     named = judged(cut, tumour, parts, labels=labelled(), tissues={1: "vein", 2: "artery"})
-    found = named.vessels
-    assert [vessel.tissue for vessel in found] == ["vein", "artery"]
+    divided = named.vessels
+    assert [vessel.tissue for vessel in divided] == ["vein", "artery"]
     # Faces at the border count wholly or not: a random half of an edge.
-    assert [vessel.diameter_mm for vessel in found] == pytest.approx([4.0, 3.0], abs=FACE_MM / 2)
-    # Without labels, and where they name neither arteries nor veins.
-    for labels in (None, labelled()):
-        others = divided_vessels(fine(cut), parts["vessel"], labels, {1: "cortex", 2: "medulla"})
-        assert [each.tissue for each in others] == ["vessel", "vessel"]
+    assert [vessel.diameter_mm for vessel in divided] == pytest.approx([4.0, 3.0], abs=FACE_MM / 2)
     assert [vessel["tissue"] for vessel in named.report()["vessels"]] == ["vein", "artery"]
-
-
-def fine(cut) -> trimesh.Trimesh:
-    """The resection surface in small faces."""
-    surface = cut.resection_surface()
-    return trimesh.Trimesh(
-        *trimesh.remesh.subdivide_to_size(surface.vertices, surface.faces, FACE_MM), process=False
-    )
 
 
 @pytest.mark.parametrize(("share", "counts"), [(0.9, False), (1.1, True)])
 def test_a_part_that_the_cut_only_grazes_is_not_opened(share, counts):
     """Twelve faces of one area are inside a part, of which together they make a share of what counts."""
     side = np.sqrt(share * LEAST_OPENED_MM2 / 6)
-    x, y = np.meshgrid(side * np.arange(11), side * np.arange(7), indexing="ij")
     corner = np.arange(77).reshape(11, 7)
     a, b, c, d = (
-        each.ravel() for each in (corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:])
+        part.ravel() for part in (corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:])
     )
     faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
-    surface = trimesh.Trimesh(np.column_stack([x.ravel(), y.ravel(), np.zeros(77)]), faces, process=False)
+    places = np.indices((11, 7, 1)).reshape(3, -1).T * side
+    surface = trimesh.Trimesh(places, faces, process=False)
     # Three by two squares, from the fourth and the third on.
     part = trimesh.creation.box(bounds=[[3 * side, 2 * side, -1.0], [6 * side, 4 * side, 1.0]])
-    assert len(divided_vessels(surface, part, None, {})) == counts
+    # Without labels, and where they name neither arteries nor veins.
+    for labels in (None, labelled()):
+        vessels_cut = divided_vessels(surface, part, labels, {1: "cortex", 2: "medulla"})
+        assert [vessel.tissue for vessel in vessels_cut] == ["vessel"] * counts
     assert _opened_mm2(surface, part) == pytest.approx(share * LEAST_OPENED_MM2 * counts, rel=1e-9)
-
-
-def test_vessels_that_are_not_labelled_are_not_said_to_be_undivided():
-    surface = fine(cut_by(ORGAN, half_space(6.0)))
-    assert divided_vessels(surface, None, None, {}) is None, "not labelled"
 
 
 @pytest.mark.parametrize(
@@ -236,23 +212,26 @@ def test_a_trace_is_not_written_as_zero(value, digits, text):
     assert shown(value, "ml", digits) == text
 
 
+VESSELS = DividedVessel("vein", 7.0), DividedVessel("artery", 5.0), DividedVessel("vein", 2.0)
+# Figures that the report has as they are.
+AS_THEY_ARE = dict(
+    specimen_ml=21.52,
+    tumour_left_ml=0.44,
+    parenchyma_removed_ml=13.2,
+    parenchyma_removed_percent=8.25,
+    collecting_system_opened_mm2=12.6,
+    volume_change_percent=-0.31,
+)
+
+
 def by_hand(**changed) -> Judgement:
     """A cut of five faces: 10 mm2 2 mm deep in the tumour, 20 mm2 within the error of its surface, the
     others beside it.
     """
     area, distance = np.array([10.0, 20.0, 30.0, 40.0, 50.0]), np.array([-2.0, -0.05, 0.5, 2.5, 4.0])
-    values = dict(
-        margin=MarginMap(np.zeros((5, 3)), area, distance),
-        margin_as_cut=MarginMap(np.zeros((5, 3)), area, distance + 2.6),
-        specimen_ml=21.52,
-        tumour_left_ml=0.44,
-        parenchyma_removed_ml=13.2,
-        parenchyma_removed_percent=8.25,
-        collecting_system_opened_mm2=12.6,
-        vessels=(DividedVessel("vein", 7.0), DividedVessel("artery", 5.0), DividedVessel("vein", 2.0)),
-        volume_change_percent=-0.31,
-    )
-    return Judgement(**values | changed)
+    margins = (MarginMap(np.zeros((5, 3)), area, distance + more) for more in (0.0, 2.6))
+    values = dict(zip(("margin", "margin_as_cut"), margins, strict=True), vessels=VESSELS)
+    return Judgement(**AS_THEY_ARE | values | changed)
 
 
 REPORT = dict(
@@ -264,18 +243,9 @@ REPORT = dict(
     margin_below_3_mm2=100.0,
     margin_below_5_mm2=150.0,
     positive_margin_mm2=10.0,
-    tumour_left_ml=0.44,
-    specimen_ml=21.52,
-    parenchyma_removed_ml=13.2,
-    parenchyma_removed_percent=8.25,
-    collecting_system_opened_mm2=12.6,
-    vessels=[
-        dict(tissue="vein", diameter_mm=7.0),
-        dict(tissue="artery", diameter_mm=5.0),
-        dict(tissue="vein", diameter_mm=2.0),
-    ],
     bed_mm2=150.0,
-    volume_change_percent=-0.31,
+    vessels=[asdict(vessel) for vessel in VESSELS],
+    **AS_THEY_ARE,
 )
 
 
@@ -304,7 +274,7 @@ def test_the_cost_of_a_cut_by_hand():
     """100 mm2 of collecting system or a vessel of 3 mm are 1 ml, a missing millimetre 5 ml, and 1 cm2 of
     tumour 50 ml.
     """
-    found = cost_terms(by_hand(), 4.0)
+    terms = cost_terms(by_hand(), 4.0)
     vessels = 0.14 * np.pi / 4 * (49.0 + 25.0 + 4.0)
     expected = {
         "parenchyma": 13.2,
@@ -313,7 +283,7 @@ def test_the_cost_of_a_cut_by_hand():
         "missing margin": 5 * (4.0 - 0.1),
         "positive margin": 5.0,
     }
-    assert found == pytest.approx(expected) and 0.14 * np.pi / 4 * 9 == pytest.approx(1, abs=0.02)
+    assert terms == pytest.approx(expected) and 0.14 * np.pi / 4 * 9 == pytest.approx(1, abs=0.02)
     assert cost_ml(by_hand(), 4.0) == pytest.approx(sum(expected.values()))
     assert cost_terms(by_hand(), 0.0)["missing margin"] == 0
 
@@ -349,9 +319,9 @@ def test_the_reports_distance_of_the_score_is_the_least():
 
 
 def test_the_page_writes_the_figures_of_the_report():
-    asked = dict(technique="wedge", margin_asked_mm=4.0, depth_mm=None, filling="air")
+    settings = dict(technique="wedge", margin_asked_mm=4.0, depth_mm=None, filling="air")
     seen = dict(tumour_seen_percent=81.6, score_to_tumour_mm=2.34)
-    assert dict(rows_of(asked | seen | REPORT | dict(import_warnings=["a", "b"]))) == {
+    assert dict(rows_of(settings | seen | REPORT | dict(import_warnings=["a", "b"]))) == {
         "technique": "wedge, to the tumour's depth; air in the crater",
         "tumour surface seen": "82 %",
         "margin": "0.0 mm least, 2.1 mm mean; asked 4",

@@ -77,32 +77,25 @@ def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_directions_are_units_evenly_around():
-    found = directions(300)
-    assert np.linalg.norm(found, axis=1) == pytest.approx(1)
+    vectors = directions(300)
+    assert np.linalg.norm(vectors, axis=1) == pytest.approx(1)
     cosines = np.clip(np.random.default_rng(1).normal(size=(2000, 3)), -3, 3)
     cosines /= np.linalg.norm(cosines, axis=1, keepdims=True)
-    assert np.degrees(np.arccos((cosines @ found.T).max(axis=1))).max() < GRAIN_DEG
+    assert np.degrees(np.arccos((cosines @ vectors.T).max(axis=1))).max() < GRAIN_DEG
     # Second moments of a sphere are those of a third along each axis.
-    assert found.T @ found / 300 == pytest.approx(np.eye(3) / 3, abs=0.01)
+    assert vectors.T @ vectors / 300 == pytest.approx(np.eye(3) / 3, abs=0.01)
 
 
-def test_a_tumour_on_top_has_passes_from_above_only():
-    found = found_for(18.0 * Z)
-    assert [each.motion for each in found] == ["slide", "tilt"]
-    assert all(each.side == "from above" for each in found)
-    for each in found:
-        assert each.frame[:3, 2] == pytest.approx(Z) and each.frame[:3, 0] == pytest.approx(X)
-        assert each.frame[:3, 3] == pytest.approx(18.0 * Z, abs=VOXEL_MM / 2)
-
-
-@pytest.mark.parametrize("aside", [40.0, -60.0])
-def test_a_tumour_at_the_side_has_passes_from_there_too(aside):
-    found = found_for(18.0 * aside_by(aside))
-    assert [each.motion for each in found] == ["slide", "slide", "tilt"]
-    assert found[0].frame[:3, 2] == pytest.approx(Z)
-    for each in found[1:]:
-        assert angle_deg(each.frame[:3, 2], aside_by(aside)) < GRAIN_DEG
-        assert each.side == "from the nearest side"
+@pytest.mark.parametrize("aside", [0.0, 40.0, -60.0])
+def test_passes_are_from_above_and_those_of_a_tumour_at_the_side_from_there_too(aside):
+    kinds = found_for(18.0 * aside_by(aside))
+    side = "from the nearest side" if aside else "from above"
+    besides = [("slide", side), ("tilt", side)]
+    assert [(kind.motion, kind.side) for kind in kinds] == [("slide", "from above"), *besides][not aside :]
+    above, others = kinds[0].frame, kinds[1:]
+    assert above[:3, 2] == pytest.approx(Z) and above[:3, 0] == pytest.approx(X)
+    assert above[:3, 3] == pytest.approx(18.0 * aside_by(aside), abs=VOXEL_MM / 2)
+    assert all(angle_deg(kind.frame[:3, 2], aside_by(aside)) < GRAIN_DEG for kind in others)
 
 
 def test_no_side_is_below_the_organ():
@@ -121,7 +114,7 @@ def test_the_nearest_side_is_one_that_can_be_reached():
     assert outward[1] < -0.1
     assert nearest_side(trial_of(centre[None], lambda poses: ~everywhere(poses))) is None
     nowhere = found_for(centre, lambda poses: ~everywhere(poses))
-    assert len(nowhere) == 2 and all(each.side == "from above" for each in nowhere)
+    assert len(nowhere) == 2 and all(kind.side == "from above" for kind in nowhere)
 
 
 def test_half_of_a_target_is_measured_across_and_along():
@@ -173,11 +166,11 @@ def test_a_search_begins_with_passes_over_the_target(motion):
 
 def test_rows_lie_side_by_side_over_the_whole_target():
     kind = kind_of("slide")
-    rows = [kind.values(each) for each in kind.rows()]
-    assert [each["heading_deg"] for each in rows] == pytest.approx([0.0] * 5 + [90.0] * 5)
-    assert all(each["lean_deg"] == each["lean_aside_deg"] == each["follow"] == 0.0 for each in rows)
+    rows = [kind.values(parameters) for parameters in kind.rows()]
+    assert [row["heading_deg"] for row in rows] == pytest.approx([0.0] * 5 + [90.0] * 5)
+    assert all(row["lean_deg"] == row["lean_aside_deg"] == row["follow"] == 0.0 for row in rows)
     # As many as needed, and one more; they share the target.
-    two, three = ([each["aside"] * RADIUS for each in part] for part in (rows[:2], rows[2:5]))
+    two, three = ([row["aside"] * RADIUS for row in part] for part in (rows[:2], rows[2:5]))
     assert np.diff(two) == pytest.approx(RADIUS, rel=0.1) and np.mean(two) == pytest.approx(0, abs=1e-9)
     assert np.diff(three) == pytest.approx(2 * RADIUS / 3, rel=0.1) and three[1] == pytest.approx(0, abs=1e-9)
     narrow = replace(kind, width_mm=0.1)
@@ -188,8 +181,8 @@ RADIUS = 12.0
 
 
 def kind_of(motion: str) -> PassKind:
-    found = found_for(16.0 * Z, radius=RADIUS)
-    return next(each for each in found if each.motion == motion)
+    kinds = found_for(16.0 * Z, radius=RADIUS)
+    return next(kind for kind in kinds if kind.motion == motion)
 
 
 def values_of(kind: PassKind, **changes: float) -> dict[str, float]:
@@ -224,7 +217,7 @@ def test_a_sweep_has_few_passes_or_as_many_as_a_wide_target_needs():
     for half, most in (([5.0, 5.0], 4), ([30.0, 50.0], 4), ([45.0, 39.0], 5), ([900.0, 900.0], MOST_PASSES)):
         assert replace(kind, half_mm=np.array(half), width_mm=16.0).most_passes == most
     point = replace(kind, half_mm=np.zeros(2))
-    assert [point.values(each)["aside"] for each in point.rows()] == [0.0, -0.5, 0.5] * 2
+    assert [point.values(parameters)["aside"] for parameters in point.rows()] == [0.0, -0.5, 0.5] * 2
 
 
 def test_half_of_the_extent_across_and_along_depends_on_the_heading():
@@ -258,7 +251,7 @@ def test_straight_sweeps_point_down_and_cover_the_target_side_by_side(trial):
     assert faces_in(one)[:, 0] == pytest.approx(0, abs=VOXEL_MM / 2)
     assert faces_in(one)[[0, -1], 1] == pytest.approx([-12, 12], abs=VOXEL_MM)
     assert len(rows) == 2
-    aside = [faces_in(each)[0, 0] for each in rows]
+    aside = [faces_in(poses)[0, 0] for poses in rows]
     assert np.diff(aside) == pytest.approx([WIDTH]) and np.mean(aside) == pytest.approx(0, abs=VOXEL_MM / 2)
 
 
@@ -267,7 +260,7 @@ def test_random_sweeps_depend_on_the_seed_and_are_over_the_target(trial):
     assert len(first) == 3
     assert all(map(np.array_equal, first, again)) and not np.array_equal(first[0][0], other[0][0])
     assert (np.linalg.norm(faces_in(np.concatenate(first))[:, :2], axis=1) < 12 * (np.sqrt(2) + 1)).all()
-    headings = [each[-1, :3, 3] - each[0, :3, 3] for each in first]
+    headings = [poses[-1, :3, 3] - poses[0, :3, 3] for poses in first]
     assert all(
         abs(angle_deg(a / np.linalg.norm(a), b / np.linalg.norm(b))) > 1 for a, b in pairwise(headings)
     )
@@ -286,19 +279,19 @@ def test_the_poses_of_a_plan_are_those_of_the_path_in_the_patient():
     assert np.linalg.det(placed[:, :3, :3]) == pytest.approx(1)
     assert placed.tolist() == pytest.approx(np.array(in_patient(poses)))
     again = planned(SimpleNamespace(case=case), sweep_of(*path))
-    assert [len(each) for each in again] == [len(each) for each in path]
+    assert [len(poses) for poses in again] == [len(poses) for poses in path]
     assert np.concatenate(again) == pytest.approx(poses, abs=1e-9)
 
 
 def test_a_kidney_without_a_tumour_is_given_one_under_its_highest_place():
     organ = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
     organ.vertices *= [25.0, 25.0, 50.0]
-    given = plan_comparison.with_tumour(LoadedAnatomy(organ, None, None, ()), np.array([0, 9.81, 0]))
-    tumour = given.tumour
+    with_one = plan_comparison.with_tumour(LoadedAnatomy(organ, None, None, ()), np.array([0, 9.81, 0]))
+    tumour = with_one.tumour
     assert tumour.volume == pytest.approx(4 / 3 * np.pi * plan_comparison.TUMOUR_MM**3, rel=0.02)
     middle = tumour.vertices.mean(axis=0)
     share = (middle[2] + 50) / 100
     assert share == pytest.approx(plan_comparison.ALONG, abs=0.12) and middle[1] < 0 and abs(middle[0]) < 2
     depths = -signed_distance(organ.vertices, organ.faces, tumour.vertices)[0]
     assert depths.min() == pytest.approx(plan_comparison.UNDER_MM, abs=0.3)
-    assert plan_comparison.with_tumour(given, Z) is given
+    assert plan_comparison.with_tumour(with_one, Z) is with_one

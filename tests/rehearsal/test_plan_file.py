@@ -1,7 +1,6 @@
 """A plan's file, and what is refused of plans and of the command lines that make and follow them."""
 
 import json
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from pydantic import ValidationError
 import app
 from rehearsal.commands.plan_command import over_limit_warning
 from rehearsal.input_files import check_plan, check_reach
-from rehearsal.planning import trial_workers
+from rehearsal.planning import sweep_trial
 from rehearsal.planning.plan_file import (
     APPROACH_S,
     LIFT_MM,
@@ -90,19 +89,11 @@ ODD[3] = [0, 0, 0, 2.0]
         ("sweeps.0.passes", [], "list should have at least 1 item"),
         ("sweeps.0.passes.0", [], "list should have at least 2 items"),
         ("sweeps.0.passes.0", [np.eye(4).tolist()], "list should have at least 2 items"),
-        (
-            "sweeps.0.passes.0.1",
-            np.diag([1.0, 1, 1.01, 1]).tolist(),
-            "not rigid",
-        ),
+        ("sweeps.0.passes.0.1", np.diag([1.0, 1, 1.01, 1]).tolist(), "not rigid"),
         ("sweeps.0.passes.0.1", SHEARED.tolist(), "not rigid"),
         ("sweeps.0.passes.0.1", np.diag([1.0, 1, -1, 1]).tolist(), "three right-handed unit axes"),
         ("sweeps.0.passes.0.1", ODD.tolist(), "a last row of 0 0 0 1"),
-        (
-            "sweeps.0.passes.0.1",
-            np.eye(3).tolist(),
-            "list should have at least 4 items",
-        ),
+        ("sweeps.0.passes.0.1", np.eye(3).tolist(), "list should have at least 4 items"),
         ("sweeps.0.passes.0.1.0.3", float("nan"), "input should be a finite number"),
         ("sweeps.0.passes.0.1.0.3", "far", "input should be a valid number"),
         ("sweeps.0.parts", dict(path_mm=3.0), "seen is missing"),
@@ -130,9 +121,9 @@ def refused_file(tmp_path, content: bytes) -> str:
     path.write_bytes(content)
     with pytest.raises(PlanError) as error:
         read_plan(path)
-    told = str(error.value)
-    assert told.startswith(f"{path}: ") and "\n" not in told and len(told) < 450
-    return told
+    refusal = str(error.value)
+    assert refusal.startswith(f"{path}: ") and "\n" not in refusal and len(refusal) < 450
+    return refusal
 
 
 def test_a_turned_pose_is_taken_and_no_file_or_a_folder_refused(tmp_path):
@@ -162,17 +153,13 @@ def test_a_plan_is_followed_only_on_its_anatomy_with_its_probe():
         check_plan(plan_of(probe={}), plan.anatomy, probe)
 
 
-@pytest.mark.parametrize("far_mm", [900.0, 2000.0])
-def test_a_pose_far_from_the_organ_is_refused_by_its_number(far_mm):
-    near, far = straight_pass(3), straight_pass(3)
-    far[1, :3, 3] += [0, 0, far_mm]
-    check_reach(plan_of(sweep_of(near, near)), ORIGIN[None])
-    with (
-        nullcontext()
-        if far_mm < 1000
-        else pytest.raises(PlanError, match=r"sweep 2, pass 2, pose 2 is 2000 mm")
-    ):
-        check_reach(plan_of(sweep_of(near), sweep_of(near, far)), ORIGIN[None])
+def test_a_pose_far_from_the_organ_is_refused_by_its_number():
+    near, far, farther = straight_pass(3), straight_pass(3), straight_pass(3)
+    far[1, 2, 3] += 900.0
+    farther[1, 2, 3] += 2000.0
+    check_reach(plan_of(sweep_of(near, far)), ORIGIN[None])
+    with pytest.raises(PlanError, match=r"sweep 2, pass 2, pose 2 is 2000 mm"):
+        check_reach(plan_of(sweep_of(near), sweep_of(near, farther)), ORIGIN[None])
 
 
 # As a track
@@ -199,23 +186,21 @@ def test_a_sweep_as_a_track_goes_at_its_speed_and_is_lifted_between_passes(tmp_p
 # The trocar, and the command line
 
 
-@pytest.mark.parametrize(
-    "values",
-    [
-        dict(axis=(0, 0, 0)),
-        dict(cone_deg=0),
-        dict(cone_deg=91),
-        dict(wrist_deg=-1),
-        dict(wrist_deg=181),
-        dict(longest_mm=0),
-        dict(at_mm=(float("nan"), 0, 0)),
-        dict(at_mm=(0, 0)),
-        dict(port=(0, 0, 0)),
-    ],
+OUT_OF_RANGE = dict(
+    axis=[(0, 0, 0)],
+    cone_deg=[0, 91],
+    wrist_deg=[-1, 181],
+    longest_mm=[0],
+    at_mm=[(float("nan"), 0, 0), (0, 0)],
+    port=[(0, 0, 0)],
 )
-def test_a_trocar_out_of_range_is_refused(values):
-    with pytest.raises(ValidationError):
-        Trocar.model_validate(values)
+
+
+@pytest.mark.parametrize(("name", "values"), OUT_OF_RANGE.items(), ids=OUT_OF_RANGE)
+def test_a_trocar_out_of_range_is_refused(name, values):
+    for value in values:
+        with pytest.raises(ValidationError):
+            Trocar.model_validate({name: value})
 
 
 def test_the_command_line_changes_the_scenes_trocar():
@@ -263,10 +248,10 @@ def test_a_sweep_above_the_compression_limit_is_warned_of():
 )
 def test_the_plan_command_refuses_in_one_line(ball_scene, capsys, options, words):
     line = ["plan", ball_scene, "--out", ball_scene / "plan.json", "--jobs", 1]
-    assert app.main([str(each).format(ball_scene) for each in [*line, *options]]) == 2
-    told = capsys.readouterr().err
+    assert app.main([str(argument).format(ball_scene) for argument in [*line, *options]]) == 2
+    printed = capsys.readouterr().err
     # Before it begins: without a bar.
-    assert told.startswith("nephron: ") and words in told and told.count("\n") == 1
+    assert printed.startswith("nephron: ") and words in printed and printed.count("\n") == 1
     assert not (ball_scene / "plan.json").exists()
 
 
@@ -277,7 +262,7 @@ def test_a_plan_is_made_on_the_tissue_of_the_quality(ball_scene, monkeypatch, ca
         cells_mm.append(problem.scene.tissue.cell_mm)
         raise PlanError("no workers")
 
-    monkeypatch.setattr(trial_workers, "TrialWorkers", nobody)
+    monkeypatch.setattr(sweep_trial, "TrialWorkers", nobody)
     for quality in ((), ("--quality", "fast"), ("--quality", "accurate")):
         assert app.main(["plan", str(ball_scene), "--out", str(ball_scene / "plan.json"), *quality]) == 2
         assert "nephron: no workers" in capsys.readouterr().err
@@ -290,5 +275,5 @@ def test_rehearse_refuses_a_plan_of_another_patient_before_it_builds_anything(ba
     assert "the plan is for other anatomy" in capsys.readouterr().err
     (ball_scene / "plan.json").write_text("{}")
     assert app.main(["rehearse", str(ball_scene), "--plan", str(ball_scene / "plan.json")]) == 2
-    told = capsys.readouterr().err
-    assert "not a plan" in told and told.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert "not a plan" in printed and printed.count("\n") == 1

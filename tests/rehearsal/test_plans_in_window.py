@@ -5,7 +5,6 @@ from concurrent.futures import wait
 from contextlib import contextmanager
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import trimesh
 from plan_ball import (
@@ -156,18 +155,9 @@ def test_the_remaining_time_is_shown_once_there_is_a_pace(monkeypatch, searching
     ended(plans)
 
 
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [
-        (0, "under a minute"),
-        (29, "under a minute"),
-        (31, "about 1 min"),
-        (89, "about 1 min"),
-        (480, "about 8 min"),
-    ],
-)
-def test_a_rough_time_is_in_whole_minutes(seconds, words):
-    assert minutes_in_words(seconds) == words
+def test_a_rough_time_is_in_whole_minutes():
+    words = [minutes_in_words(seconds) for seconds in (0, 29, 31, 89, 480)]
+    assert words == ["under a minute"] * 2 + ["about 1 min"] * 2 + ["about 8 min"]
 
 
 @pytest.mark.parametrize("began", [True, False])
@@ -180,12 +170,13 @@ def test_the_key_stops_a_search_and_otherwise_shows_the_next_sweep(
         workers = searching.workers
 
         @contextmanager
-        def late(*given):
+        def late(*arguments):
             assert made.wait(LONGEST_S)
-            with workers(*given) as each:
-                yield each
+            with workers(*arguments) as crew:
+                yield crew
 
         monkeypatch.setattr(plans_in_window, "Workers", late)
+    assert message(plans, next_plan=True) == "No plan: {plan} makes one"
     plans.measurements.guide = guide = guide_over_ball(plan_of(sweep_of(straight_pass(3))))
     message(plans, plan=True)
     search = plans._job
@@ -250,15 +241,3 @@ def test_the_target_is_shown_and_without_a_tumour_it_is_the_organ(searching, pla
     searching.run_trials(4)
     ended(plans)
     assert searching.problems[0].target == "organ"
-
-
-def test_sweeps_are_shown_in_turn(plans):
-    assert message(plans, next_plan=True) == "No plan: {plan} makes one"
-    first, second = straight_pass(3), straight_pass(2)
-    plans.measurements.guide = guide = guide_over_ball(
-        plan_of(sweep_of(first), sweep_of(second, name="b", seen=0.5))
-    )
-    guide.follow(first[0])
-    assert guide.next_pose == 1 and np.array_equal(guide.guidance().done, [False, False])
-    assert message(plans, next_plan=True) == "Plan 2: b, covers 50 %"
-    assert message(plans, next_plan=True) == "Plan hidden"

@@ -24,6 +24,7 @@ from rehearsal.loop.command import BeginAction, Bookmark, Checkpoint, Load, Mark
 from rehearsal.loop.timeline import Timeline
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.notices import Notices
+from rehearsal.planning.plan_file import write_plan
 from rehearsal.pressed_organ import PressedOrgan
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection import proposal
@@ -45,13 +46,10 @@ from rehearsal.resection.resection_plan import (
     is_resection_plan,
     planned_cut,
     read_resection_plan,
-    write_resection_plan,
 )
-from rehearsal.resection.resection_state import NO_RESECTION
+from rehearsal.resection.resection_state import NO_RESECTION, ResectionScript, ScriptedAction
 from rehearsal.resection.resection_view import ResectionView, cut_settings
-from rehearsal.resection.score_file import save_score
-from rehearsal.resection.score_line import ResectionError
-from rehearsal.resection.script import ResectionScript, ScriptedAction
+from rehearsal.resection.score_line import ResectionError, save_score
 from rehearsal.sessions.packed_arrays import pack_state, unpack_state
 from rehearsal.sessions.recorder import SessionRecorder, header_of
 from rehearsal.sessions.replay import Replay, ReplayCheck
@@ -352,7 +350,7 @@ def test_cuts_that_are_undone_leave_no_fields_and_a_cut_survives_as_text(rehears
         rehearsal.do(Load(state=from_text))
         assert anatomy.cut is not None
         gc.collect()
-        fields.append(sum(isinstance(each, Field) for each in gc.get_objects()))
+        fields.append(sum(isinstance(thing, Field) for thing in gc.get_objects()))
     assert fields[1] == fields[3]
 
 
@@ -362,8 +360,8 @@ def test_the_distance_of_a_line_to_the_tumour_is_negative_over_it():
         frame=lambda: np.eye(3), points=np.array([[0.0, 0, 9], [5, 0, 9], [8, 0, 9], [8, 9, 9]])
     )
     tumour = trimesh.creation.box([10.0, 10.0, 10.0])
-    found = distance_to_tumour(line, tumour)
-    assert found == pytest.approx([-5.0, 0.0, 3.0, 5.0], abs=1e-12)
+    distances = distance_to_tumour(line, tumour)
+    assert distances == pytest.approx([-5.0, 0.0, 3.0, 5.0], abs=1e-12)
     assert len(distance_to_tumour(line, None)) == 0
 
 
@@ -386,8 +384,6 @@ def test_the_view_warns_of_a_line_that_is_too_near_and_shows_the_coming_cut(rehe
     assert shown.tumour_mm.min() > MARGIN_MM - 0.5
     assert shown.score(MARGIN_MM + 2.0).is_near.all()
     assert "red: " in shown.status(CutSettings(margin_mm=MARGIN_MM + 2.0))
-    assert f"{shown.line.length_mm:.0f} mm" in shown.status(CutSettings())
-    assert "seen" not in shown.status(CutSettings())
     look(1.0, False)
     assert "no part of the tumour was seen" in shown.status(CutSettings())
     assert "tumour surface seen 0 %" in shown.status(CutSettings())
@@ -450,7 +446,7 @@ def test_page_score_and_plan_are_written_and_compared(patient, rehearsal, marks,
     monkeypatch.setattr(proposal, "_lines", lambda *_: [proposals[0].cut.line])
     with pytest.raises(ResectionError, match="hilum"):
         propose(*about, trimesh.creation.icosphere().apply_translation(case.tumour.center_mass))
-    costs = [each.cost_ml for each in proposals]
+    costs = [candidate.cost_ml for candidate in proposals]
     assert len(costs) > 1 and costs == sorted(costs) and proposals[0].settings.technique == "enucleoresection"
     assert proposals[0].judgement.margin.margin_mm.min() > MARGIN_MM - 0.1
     why = why_first(proposals)
@@ -466,9 +462,9 @@ def test_page_score_and_plan_are_written_and_compared(patient, rehearsal, marks,
     )
     draw_page(best.cut, best.judgement, case.tumour, figures, tmp_path / "plan.png", "Planned resection")
     assert (tmp_path / "plan.png").stat().st_size > 10_000
-    cuts = [planned_cut(each, np.zeros(3)) for each in proposals]
+    cuts = [planned_cut(candidate, np.zeros(3)) for candidate in proposals]
     plan, path = ResectionPlan(anatomy="a", margin_mm=MARGIN_MM, cuts=cuts), tmp_path / "plan.json"
-    write_resection_plan(plan, path)
+    write_plan(plan, path)
     assert is_resection_plan(path) and read_resection_plan(path) == plan
     with pytest.raises(CommandError, match="the scripted press cuts nothing; open it in a window, or add"):
         read_files(RehearseOptions(headless=True, plan=path))

@@ -29,7 +29,7 @@ from rehearsal.resection.score_line import (
 ORGAN = ball(R)
 
 
-@pytest.mark.parametrize("count", [3, 5, 60])
+@pytest.mark.parametrize("count", [3, 5, 24])
 def test_the_line_is_made_of_great_circles(count):
     line = score_line(ORGAN, circle(count))
     # Neighbours are apart by an arc whose chord is 2 R sin(angle) sin(pi / n).
@@ -43,7 +43,7 @@ def test_the_line_is_made_of_great_circles(count):
 
 
 def test_its_direction_is_out_of_the_organ_whichever_way_round_the_marks_are():
-    for marks in (circle(), circle()[::-1]):
+    for marks in (circle(12), circle(12)[::-1]):
         line = score_line(ORGAN, marks)
         # The marks are on a circle; the faces that carry them tilt it by less than the faces' own distance
         # from the ball.
@@ -145,13 +145,13 @@ def test_a_mark_of_the_image_is_on_the_capsule_nearest_to_the_probe(across_mm):
     half, turn, middle = np.array([20.0, 12.0]), rotation_about([0, 0, 1], 25)[:2, :2], np.array([3.0, 24.0])
     angle = np.linspace(0, 2 * np.pi, 1001)
     points = half * np.column_stack([np.cos(angle), np.sin(angle)]) @ turn.T + middle
-    found = _nearest_to_probe(np.stack([points[:-1], points[1:]], axis=1), across_mm)
+    place = _nearest_to_probe(np.stack([points[:-1], points[1:]], axis=1), across_mm)
     # x' A x = 1, with x from the middle: a quadratic equation in the depth.
     form = turn @ np.diag(half**-2.0) @ turn.T
     aside = across_mm - middle[0]
     roots = np.roots([form[1, 1], 2 * form[0, 1] * aside, form[0, 0] * aside**2 - 1])
     # Chords of 0.1 mm are inside the ellipse by less than 0.001 mm.
-    assert found == pytest.approx((across_mm, middle[1] + roots.min()), abs=1e-3)
+    assert place == pytest.approx((across_mm, middle[1] + roots.min()), abs=1e-3)
     with pytest.raises(ResectionError, match="ends before the edge"):
         _nearest_to_probe(np.stack([points[:-1], points[1:]], axis=1), 30.0)
 

@@ -5,7 +5,7 @@ import pytest
 from conftest import rotation_about
 from scipy.spatial.transform import Rotation
 
-from rehearsal.reconstruction.simulated_tracker import with_errors
+from rehearsal.reconstruction.sweep_volumes import with_errors
 from studies.freehand.freehand_sweeps import sweep_of
 from ultrasound.sweep import Sweep, SweepError
 from ultrasound.tracking_errors import TrackingErrors, with_tracking_errors
