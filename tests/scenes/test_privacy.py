@@ -15,7 +15,10 @@ from app import main
 from scenes.patients.readers.segment_names import public_text, quoted
 
 # In every text that a source has, under names that are words of the program's own sentences, too.
-TEXTS = ("Long^Small", "Wolpertinger", "X-22-ID", "St Elsewhere", "calls himself Jim", "19600229", "Ünal")
+TEXTS = (
+    *("Long^Small", "Wolpertinger", "X-22-ID", "St Elsewhere", "calls himself Jim", "19600229", "Ünal"),
+    *("Front^Back", "Bone^Rene", "29.02.60"),
+)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -83,6 +86,9 @@ def from_dicom(folder: Path) -> list[Path]:
         "Kidney_L": list(rings(LEFT)),
         "GTV Wolpertinger": list(rings(TUMOUR)),
         "Ünal": list(rings((LEFT[0], np.array([9.0, 9.0, 12.0])))),
+        "PRV Kidney_L Front^Back": list(rings(LEFT)),
+        "PRV Kidney_L Bone^Rene": list(rings(LEFT)),
+        "Befund 29.02.60": list(rings((LEFT[0] - [0, 0, 22], np.full(3, 9.0)))),
     }
     return [series.folder, write_structures(folder / "rt.dcm", regions, series.uid, edit=edit)]
 

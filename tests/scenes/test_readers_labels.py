@@ -285,6 +285,18 @@ class TestSegmentations:
         path = write_segmentation(tmp_path / "seg.dcm", series, {"Kidney": shares}, "FRACTIONAL")
         assert np.array_equal(by_name(open_labels(path).maps(None), ct_grid(series))["Kidney"], shares >= 0.5)
 
+    def test_half_is_in(self, tmp_path):
+        """127 of 254."""
+        series, shares = Series(tmp_path / "ct"), np.zeros((6, 10, 12))
+        shares[1:4, 2:6, 2:6], shares[2, 3, 3] = 0.4, 0.5
+        data = pydicom.dcmread(
+            path := write_segmentation(tmp_path / "seg.dcm", series, {"Kidney": shares}, "FRACTIONAL")
+        )
+        data.PixelData, data.MaximumFractionalValue = data.PixelData.replace(b"\x80", b"\x7f"), 254
+        data.save_as(path)
+        found = by_name(open_labels(path).maps(None), ct_grid(series))["Kidney"]
+        assert np.array_equal(found, shares == 0.5)
+
     def test_beside_its_series(self, series, tmp_path):
         write_segmentation(tmp_path / "ct" / "seg.dcm", series, {"Kidney": solid(series, KIDNEY)})
         assert "Kidney" in by_name(open_labels(tmp_path / "ct").maps(None))
@@ -322,18 +334,6 @@ def ring(centre, radius, direction, points=360):
     turn = np.linspace(0, 2 * np.pi, points, endpoint=False)[:, None]
     return centre + radius * (np.cos(turn) * direction[:, 0] + np.sin(turn) * direction[:, 1])
 
-    def test_half_is_in(self, tmp_path):
-        """127 of 254."""
-        series, shares = Series(tmp_path / "ct"), np.zeros((6, 10, 12))
-        shares[1:4, 2:6, 2:6], shares[2, 3, 3] = 0.4, 0.5
-        data = pydicom.dcmread(
-            path := write_segmentation(tmp_path / "seg.dcm", series, {"Kidney": shares}, "FRACTIONAL")
-        )
-        data.PixelData, data.MaximumFractionalValue = data.PixelData.replace(b"\x80", b"\x7f"), 254
-        data.save_as(path)
-        found = by_name(open_labels(path).maps(None), ct_grid(series))["Kidney"]
-        assert np.array_equal(found, shares == 0.5)
-
 
 class TestContours:
     OUTER, INNER = 5.2, 2.3
@@ -364,9 +364,10 @@ class TestContours:
         turned = Rotation.from_rotvec(0.9 * series.direction[:, 0]).as_matrix() @ series.direction
         path = write_structures(tmp_path / "rt.dcm", {"Kidney": [ring(KIDNEY[0], 5, turned)]})
         grid = open_ct(tmp_path / "ct").grid
-        assert "cross the slices" in refusal(path, read=lambda path: open_labels(path).maps(grid))
+        message = refusal(path, read=lambda path: open_labels(path).maps(grid))
+        assert "cross the slices" in message and "CT that they were drawn on" in message
 
-    @pytest.mark.parametrize("kind", ["POINT", "OPEN_PLANAR"])
+    @pytest.mark.parametrize("kind", ["POINT", "OPEN_PLANAR", None])
     def test_no_closed_contour(self, series, tmp_path, kind):
         path = write_structures(
             tmp_path / "rt.dcm", {"Kidney": [ring(KIDNEY[0], 5, series.direction)]}, kind=kind

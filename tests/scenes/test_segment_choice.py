@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from synthetic_body import LEFT, LEFT_ML, RIGHT, TUMOUR, body, coarsely, drawn, grid_around, level, points_of
+from test_label_files import strips
 
 from errors import PatientError
+from scenes.patients.import_command import label_words
 from scenes.patients.import_request import import_request
 from scenes.patients.organ_selection import find_organs
 from scenes.patients.readers.label_maps import LabelMap, Segment
@@ -46,6 +48,8 @@ DERIVED = [
     "Kidney_L_ring",
     "Kidney_eval",
     "Kidney_crop",
+    "Kidney_L_5mm",
+    "_Kidney_L",
 ]
 NOT_DERIVED = [
     "Kidney_L",
@@ -67,8 +71,9 @@ LESIONS = {
     "carcinome angiomyolipoma metastasis adenoma 肿瘤 腫瘍",
     "cyst": "Zyste kyste quiste cisti cisto Bosniak_2F 囊肿",
     "kidney": "riñón rein Niere rene rim_direito nier 腎 左肾",
-    "urine": "uretère uréter Harnleiter Nierenbecken bassinet 尿管",
-    None: "Befund ROI_1 finding unknown",
+    "urine": "uretère uréter Harnleiter Nierenbecken bassinet Left_kidney_pelvis 尿管",
+    "sinus": "Nierensinus sinus_renal",
+    None: "Befund ROI_1 finding unknown Liver_lesion Leberzyste Splenic_cyst Bone_metastasis Adrenal_mass Опухоль",
 }
 
 
@@ -126,7 +131,8 @@ class TestComposite:
     """A kidney with or without its tumour: the kidney, where no other is there."""
 
     @pytest.mark.parametrize(
-        "name", ["Kidney_L-GTV", "kidney without mass", "Kidney_L + tumour", "Kidney_L incl GTV"]
+        "name",
+        ["Kidney_L-GTV", "kidney w/o tumor", "kidney without mass", "Kidney+Tumor", "Kidney_L incl GTV"],
     )
     def test_alone_and_beside_the_kidney(self, name):
         assert tissue_of(name) == "kidney"
@@ -159,11 +165,16 @@ class TestDerived:
 
 
 class TestDrawnTwice:
-    def test_two_of_one_name_are_united_with_a_note(self):
-        maps = [segment("Kidney_L", LEFT), segment("Kidney_L", (LEFT[0] + [0, 0, 6.0], LEFT[1]))]
+    @pytest.mark.parametrize("names", [("Kidney_L", "Kidney_L"), ("Kidney_L_AB", "Kidney_L_CD")], ids=str)
+    def test_two_of_equal_rank_are_united_with_a_note(self, names):
+        maps = [segment(names[0], LEFT), segment(names[1], (LEFT[0] + [0, 0, 6.0], LEFT[1]))]
         ml, notes = organ_ml(maps)
         assert ml > 1.04 * LEFT_ML
-        assert notes == ("united, as they are one structure drawn twice: “Kidney_L”, “Kidney_L”",)
+        assert notes == (f"united, as they are one structure drawn twice: “{names[0]}”, “{names[1]}”",)
+
+    def test_each_name_is_said_once(self):
+        _, notes = organ_ml([segment(name, LEFT) for name in ("Kidney_L", "Kidney_L_1", "Kidney_L old")])
+        assert " ".join(notes).count("“Kidney_L old”") == 1
 
     @pytest.mark.parametrize("name", ["Kidney_L_Meier", "kidney left second look"])
     def test_a_longer_name_is_left_out(self, name):
@@ -198,9 +209,30 @@ class TestTheUsersWord:
 
     def test_names_with_commas(self):
         maps = [segment("Kidney, left", LEFT), segment("mass, left, lower", TUMOUR), segment("left", RIGHT)]
-        assert with_commas(["Kidney", "left"], maps) == ["Kidney, left"]
+        assert with_commas(label_words("Kidney, left", "organ"), maps) == ["Kidney, left"]
         assert with_commas(["mass", "left", "lower", "left"], maps) == ["mass, left, lower", "left"]
         assert with_commas(["1", "2"], maps) == ["1", "2"]
+
+    @pytest.mark.parametrize(
+        ("names", "words"),
+        [
+            (("2", "1"), "“2” is the name of label 1 .* and the value of label 2"),
+            (("finding", "FINDING"), "“finding” is the name of 2 labels, .*; give a value"),
+        ],
+    )
+    def test_a_word_of_two_meanings_is_refused(self, names, words):
+        with pytest.raises(PatientError, match=words):
+            assign_tissues([strips(*names)], [], {"tumour": [names[0]]})
+
+    def test_accents_tell_names_apart(self):
+        maps = [strips("Kidney_L", unicodedata.normalize("NFD", "Läsion"), "Lasion")]
+        (assigned,) = assign_tissues(maps, [], {"tumour": ["Läsion"], "cyst": ["Lasion"]})
+        assert [s.tissue for s in assigned.segments.values()] == ["kidney", "tumour", "cyst"]
+
+    def test_a_name_may_be_given_as_it_is_shown(self):
+        """Without its typographic quotation marks."""
+        organ = strips("Organ “L”").segments[1]
+        assert str(organ) == "1 “Organ L”" and organ.matches("Organ L")
 
 
 class TestUnknown:

@@ -73,6 +73,7 @@ def planes_of(one, grid):
     return np.flatnonzero(on_planes(one, grid)).tolist()
 
 
+BALL = ball(3.0 * np.arange(60), 80.0, 20.0)
 COPIES = {
     "identical": lambda c: c,
     "shifted by 0.01 mm": lambda c: c + [0.01, -0.01, 0],
@@ -83,6 +84,22 @@ COPIES = {
     "one point less": lambda c: np.delete(c, 7, axis=0),
     "closed again": lambda c: np.concatenate([c, c[:1]]),
 }
+
+
+# One outline as planning systems write it.
+OUTLINES = {
+    "each point twice": [np.repeat(np.vstack([c, c[:1]]), 2, axis=0) for c in BALL],
+    "any order and direction": [BALL[n][:: 1 - 2 * (n % 2)] for n in np.random.default_rng(1).permutation(len(BALL))],
+    "clicks of one to three points": [*BALL, *(c[:1] for c in BALL), *(c[:2] for c in BALL), BALL[5][[0, 3, 0]]],
+    "a misplaced point": [c[[*range(40), 41, 40, *range(42, 90)]] for c in BALL],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("outline", OUTLINES)
+def test_writers_of_one_outline(tmp_path, outline):
+    plain, _ = single(tmp_path, grid_of(3.0), BALL)
+    one, notes = single(tmp_path, grid_of(3.0), OUTLINES[outline])
+    assert notes == [] and millilitres(one) == pytest.approx(millilitres(plain), rel=1e-3)
 
 
 class TestCopies:
@@ -149,7 +166,6 @@ def inset(contours, mm):
     return [loop(c[0, 2], r - mm) for c, r in zip(contours, radii, strict=True) if r > mm + 0.5]
 
 
-BALL = ball(3.0 * np.arange(60), 80.0, 20.0)
 # A second observer's contours.
 OTHERS = {
     "moved by 0.4 mm": moved(BALL, 0.4),
