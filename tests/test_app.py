@@ -207,8 +207,9 @@ def volumes(tmp_path_factory) -> tuple[Path, Path]:
 
 
 # Seconds after the start of Python; the modules are loaded until 1 to 3 s.
-@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("after_s", [0.3, 0.9, 2.0])
+@pytest.mark.parametrize(
+    ("kind", "after_s"), [(signal.SIGINT, 0.3), (signal.SIGTERM, 0.9), (signal.SIGINT, 2.0)]
+)
 def test_an_import_that_is_stopped_ends_in_words_and_leaves_nothing(volumes, tmp_path, kind, after_s):
     begun = (
         "import runpy, sys; print(flush=True); sys.argv[0] = 'app.py'; runpy.run_path('app.py', "
@@ -262,35 +263,6 @@ def test_a_closed_pipe_ends_it_without_a_traceback(command):
     )
     os.close(writing)
     assert done.returncode == 1 and done.stderr == b""
-
-
-@pytest.mark.parametrize("command", [(), ("rehearse",), ("import",), ("validate",), ("calibrate",)])
-def test_help_names_every_option(command, capsys):
-    assert app.main([*command, "--help"]) == 0
-    told = capsys.readouterr().out
-    wanted = {
-        (): ("rehearse", "import", "validate", "calibrate"),
-        ("rehearse",): (
-            "--headless",
-            "--seconds",
-            "--out",
-            "--arch",
-            "--model",
-            "--cell",
-            "--young-kpa",
-            "--radius",
-            "--stiffness",
-            "--substeps",
-            "--iterations",
-        ),
-        ("import",): ("--out", "--organ", "--tumour", "--side", "--series", "--seed", "--support"),
-        ("validate",): (
-            *("--model", "--quality", "--radius", "--stiffness", "--substeps", "--iterations"),
-            *("--young-kpa", "--poisson", "--arch", "--json"),
-        ),
-        ("calibrate",): ("--out", "--radii", "--hold-out", "--grid", "--search", "--jobs", "--dask"),
-    }[command]
-    assert all(word in told for word in wanted)
 
 
 def test_a_mistake_ends_the_program_with_one_line_and_status_2(tmp_path):

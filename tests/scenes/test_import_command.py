@@ -322,6 +322,8 @@ class TestProbeAndStiffness:
             "phased"),
             ("none.toml", "--probe: 'none.toml' is no file"),
             ("bad.toml", "TransducerWidthMm"),
+            ("folder", "folder"),
+            ("page.toml", "page.toml: not text in UTF-8"),
         ],
     )  # fmt: skip
     def test_a_probe_that_is_none_is_refused_before_the_ct_is_read(
@@ -329,6 +331,8 @@ class TestProbeAndStiffness:
     ):
         monkeypatch.chdir(tmp_path)
         (tmp_path / "bad.toml").write_text('TransducerName = "Bad"\nTransducerWidthMm = -1.0\n')
+        (tmp_path / "folder").mkdir()
+        (tmp_path / "page.toml").write_bytes("# Müller\n".encode("cp1252"))
         assert main(["import", "no-such-ct", "--probe", name, "--out", "a"]) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert words in line

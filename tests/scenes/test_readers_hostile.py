@@ -102,9 +102,17 @@ class TestDicom:
     def test_empty_files_and_other_kinds_are_passed_over(self, tmp_path):
         series = Series(tmp_path)
         series.write()
-        (tmp_path / "empty.dcm").write_bytes(b"")
-        (tmp_path / "text.dcm").write_text("Doe^Jane")
-        (tmp_path / "photo.dcm").write_bytes(b"\xff\xd8\xff\xe0\x00\x10JFIF" + bytes(400))
+        others = {
+            "empty.dcm": b"",
+            "text.dcm": b"Doe^Jane",
+            "photo.dcm": b"\xff\xd8\xff\xe0\x00\x10JFIF" + bytes(400),
+            "index.html": b"<html>" * 90,
+            "viewer.exe": b"MZ" + bytes(500),
+            "rt.jar": b"PK\3\4" + bytes(900),
+            "s1-9.dcm.crdownload": bytes(300),
+        }
+        for name, content in others.items():
+            (tmp_path / name).write_bytes(content)
         assert np.array_equal(open_ct(tmp_path).read(), series.hounsfield)
 
     @pytest.mark.parametrize("content", [b"", b"Doe^Jane", b"\xff\xd8\xff\xe0\x00\x10JFIF" + bytes(400)])

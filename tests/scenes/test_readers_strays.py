@@ -69,6 +69,7 @@ PAGES = {
     "dose page": dict(ImageType=["DERIVED", "SECONDARY", "DOSE_INFO"]) | NO_PLACE,
     "burned in": dict(BurnedInAnnotation="YES") | NO_PLACE,
     "colours": dict(SamplesPerPixel=3) | NO_PLACE,
+    "thumbnail": dict(ImageType=["DERIVED", "SECONDARY"], Rows=5, Columns=6, PixelData=bytes(60)) | NO_PLACE,
     "screen save with a place": SAVED_SCREEN,
     "burned in with a place": dict(BurnedInAnnotation="YES"),
     "colours with a place": dict(SamplesPerPixel=3, PhotometricInterpretation="RGB"),
