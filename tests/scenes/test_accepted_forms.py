@@ -7,9 +7,8 @@ import gzip
 import numpy as np
 import pytest
 import SimpleITK as sitk
-import trimesh
 from dicom_series import Series, write_segmentation, write_structures
-from synthetic_body import DIRECTIONS, coarsely, level
+from synthetic_body import DIRECTIONS, coarsely, ellipsoid, level, section
 
 from scenes.patients.import_request import import_request
 
@@ -70,16 +69,8 @@ def segmentation(kind):
 
 def structures(folder, series, _):
     """Each slice's section of the ellipsoid, as its polygon."""
-    centre, axes = (KIDNEY[0] @ series.direction, KIDNEY[1] @ np.abs(series.direction))
-    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
-    circle = np.column_stack([np.cos(angle), np.sin(angle)])
-    contours = []
-    for k in range(series.size[2]):
-        at = series.positions(k) @ series.direction
-        share = 1 - ((at[2] - centre[2]) / axes[2]) ** 2
-        if share > 0:
-            flat = centre[:2] + np.sqrt(share) * axes[:2] * circle
-            contours.append(np.column_stack([flat, np.full(len(flat), at[2])]) @ series.direction.T)
+    sections = [section(KIDNEY, series.positions(k), series.direction, 200) for k in range(series.size[2])]
+    contours = [corners for corners in sections if corners is not None]
     return write_structures(folder / "rt.dcm", {"Niere links": contours}, series.uid)
 
 
@@ -115,8 +106,8 @@ def file_per_organ(folder, _, image):
 
 def surface(ending, space, scale):
     def write(folder, *_):
-        body = trimesh.creation.icosphere(subdivisions=4)
-        body.vertices = (body.vertices * KIDNEY[1] + KIDNEY[0]) * scale
+        body = ellipsoid(KIDNEY, subdivisions=4)
+        body.vertices *= scale
         if np.prod(scale) < 0:
             body.invert()
         path = folder / f"left kidney{ending}"

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
-from synthetic_body import LEFT, grid_around, level, points_of
+from synthetic_body import LEFT, ellipsoid, grid_around, level, points_of
 
 from scenes.patients.dense_findings import dense_findings
 from scenes.tissue_classes.collecting_system import DENSE_ABOVE_HU, LARGEST_STONE_ML
@@ -28,8 +28,7 @@ THIN, THICK = (1.5, 1.5, 1.5), (1.0, 1.2, 5.0)
 
 
 def organ() -> trimesh.Trimesh:
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    return trimesh.Trimesh(ball.vertices * KIDNEY[1] + KIDNEY[0], ball.faces)
+    return ellipsoid(KIDNEY)
 
 
 def made(spacing, kidney_hu, bright, labelled=None):

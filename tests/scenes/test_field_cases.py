@@ -20,6 +20,7 @@ from synthetic_body import (
     grid_around,
     level,
     points_of,
+    section,
     with_voxels,
 )
 from test_patient_space import nrrd
@@ -84,23 +85,6 @@ def slicer(path: Path, image, named):
     return written(path, labels)
 
 
-def section(solid, origin, direction=DIRECTIONS["identity"], count=48):
-    """The contour (n, 3) of an ellipsoid on a plane through a place, along two axes of a direction; None
-    where there is none.
-    """
-    centre, axes = solid
-    plane = direction[:, :2] / axes[:, None]
-    start = (np.asarray(origin) - centre) / axes
-    middle = -np.linalg.lstsq(plane, start, rcond=None)[0]
-    nearest = start + plane @ middle
-    if nearest @ nearest >= 0.999:
-        return None
-    metric = np.linalg.cholesky(np.linalg.inv(plane.T @ plane))
-    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    at = middle[:, None] + np.sqrt(1 - nearest @ nearest) * metric @ [np.cos(angles), np.sin(angles)]
-    return np.asarray(origin) + (direction[:, :2] @ at).T
-
-
 def stack(solid, heights=HEIGHTS):
     return [c for c in (section(solid, (0.0, 0.0, z)) for z in heights) if c is not None]
 
@@ -113,9 +97,8 @@ class Scan(Series):
         start = corners.min(axis=0)
         size = (np.ceil(np.ptp(corners, axis=0) / (4.0, 4.0, gap)).astype(int) + 1).tolist()
         origin = direction @ start
-        super().__init__(folder, direction, size=size, gap=gap, origin=origin, field=hounsfield, **options)
-
-    spacing = property(lambda self: (4.0, 4.0), lambda self, value: None)
+        options |= dict(field=hounsfield, spacing=(4.0, 4.0))
+        super().__init__(folder, direction, size=size, gap=gap, origin=origin, **options)
 
     def contours(self, solid, edit=lambda corners: corners):
         at = [section(solid, self.positions(k), self.direction) for k in range(self.size[2])]

@@ -24,7 +24,7 @@ from test_readers_labels import by_name, ct_grid, ring
 from scenes.patients.readers import dicom_seg
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import NEAR_MM
-from scenes.patients.readers.segment_names import is_needless, is_public
+from scenes.patients.readers.segment_names import is_needless
 
 NEEDLESS = [
     "BODY", "Body", "External", "external_1", "Skin", "Patient", "Patient "
@@ -42,17 +42,6 @@ NEEDED = [
 def test_needless_names():
     assert [name for name in NEEDLESS if not is_needless(name)] == []
     assert [name for name in NEEDED if is_needless(name)] == []
-
-
-def test_names_of_structures_alone():
-    """They identify nobody."""
-    of_structures = (
-        "adrenal_gland_left|Niere links|vertebrae_L2|kidneyL|Kidney "
-        "2|BODY|left|Segment_1|portal_vein_and_splenic_vein|"
-    )
-    assert [name for name in of_structures.split("|") if not is_public(name)] == []
-    of_persons = "Doe|kidney Doe|Doe_left|kidney 19600229|Mr L"
-    assert [name for name in of_persons.split("|") if is_public(name)] == []
 
 
 def points_between(start, end):
@@ -137,8 +126,8 @@ class TestStructures:
         the voxels that cover it.
         """
         turned = DIRECTIONS[direction]
-        series = Series(tmp_path, turned, size=(60, 60, 60), gap=5.0, origin=turned @ np.full(3, -147.5))
-        series.spacing = (5.0, 5.0)
+        origin = turned @ np.full(3, -147.5)
+        series = Series(tmp_path, turned, size=(60, 60, 60), gap=5.0, origin=origin, spacing=(5.0, 5.0))
         middle = ct_grid(series).place([[29.5, 29.5, k] for k in range(60)])
         kidney = [ring(middle[k], 12.0, turned) for k in (29, 30)]
         shown = []
@@ -171,8 +160,9 @@ class TestStructures:
         """As skimage fills it, also where it crosses itself and has corners and edges on pixels; of
         oblique ones skimage misses some.
         """
-        series = Series(tmp_path / "ct", DIRECTIONS["identity"], size=(70, 60, 4), origin=(0, 0, 0))
-        series.spacing = (1.0, 1.0)
+        series = Series(
+            tmp_path, DIRECTIONS["identity"], size=(70, 60, 4), origin=(0, 0, 0), spacing=(1.0, 1.0)
+        )
         drawn = np.random.default_rng(corners).integers(-8, 75, (3, corners, 2))
         contours = [np.column_stack([each, np.full(corners, 2.5 * k)]) for k, each in enumerate(drawn)]
         path = write_structures(tmp_path / "rt.dcm", {"Kidney": contours})

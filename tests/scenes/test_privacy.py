@@ -9,7 +9,7 @@ import pytest
 import SimpleITK as sitk
 from dicom_series import PERSON, Series, write_structures
 from pydicom.dataset import Dataset
-from synthetic_body import DIRECTIONS, LEFT, TUMOUR, body, coarsely, level
+from synthetic_body import DIRECTIONS, LEFT, TUMOUR, body, coarsely, level, section
 
 from app import main
 from scenes.patients.readers.segment_names import public_text, quoted
@@ -67,28 +67,21 @@ def from_dicom(folder: Path) -> list[Path]:
         size=(88, 61, 36),
         gap=3.5,
         origin=(-174.0, -120.0, -56.0),
-        slope=1,
+        spacing=(4.0, 4.0),
+        field=hounsfield,
     )
-    series.spacing = (4.0, 4.0)
-    series.stored = np.stack([series._stored(hounsfield, k) for k in range(36)])
     series.write(edit=edit)
-    angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
 
     def rings(solid):
-        for k in range(36):
-            z = series.positions(k)[2]
-            share = 1 - ((z - solid[0][2]) / solid[1][2]) ** 2
-            if share > 0.02:
-                around = np.column_stack([np.cos(angle), np.sin(angle)]) * np.sqrt(share) * solid[1][:2]
-                yield np.column_stack([solid[0][:2] + around, np.full(60, z)])
+        return [ring for k in range(36) if (ring := section(solid, series.positions(k))) is not None]
 
     regions = {
-        "Kidney_L": list(rings(LEFT)),
-        "GTV Wolpertinger": list(rings(TUMOUR)),
-        "Ünal": list(rings((LEFT[0], np.array([9.0, 9.0, 12.0])))),
-        "PRV Kidney_L Front^Back": list(rings(LEFT)),
-        "PRV Kidney_L Bone^Rene": list(rings(LEFT)),
-        "Befund 29.02.60": list(rings((LEFT[0] - [0, 0, 22], np.full(3, 9.0)))),
+        "Kidney_L": rings(LEFT),
+        "GTV Wolpertinger": rings(TUMOUR),
+        "Ünal": rings((LEFT[0], np.array([9.0, 9.0, 12.0]))),
+        "PRV Kidney_L Front^Back": rings(LEFT),
+        "PRV Kidney_L Bone^Rene": rings(LEFT),
+        "Befund 29.02.60": rings((LEFT[0] - [0, 0, 22], np.full(3, 9.0))),
     }
     return [series.folder, write_structures(folder / "rt.dcm", regions, series.uid, edit=edit)]
 
@@ -133,6 +126,7 @@ def test_no_file_names_the_patient_and_no_sentence_is_garbled(source, shown, tmp
     [
         ("kidney_left", True), ("Renal mass "
             "2", True), ("BODY", True), ("vertebrae_L1", True), ("GTV_PRV5", True),
+        ("Niere links", True), ("kidneyL", True), ("portal_vein_and_splenic_vein", True), ("", True), ("Mr L", False),
         ("Doe_left", False), ("GTV "
             "Doe", False), ("kidney 19600229", False), ("Carter kidney", False), ("Harnisch", False),
     ],

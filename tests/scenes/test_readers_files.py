@@ -9,7 +9,7 @@ import pytest
 import SimpleITK as sitk
 from dicom_series import Series, save
 from synthetic_body import DIRECTIONS, grid_around, with_voxels
-from test_readers import AIR, RAS, affine_of, nifti, noise, written
+from test_readers import AIR, noise, written
 
 from errors import PatientError
 from scenes.patients.readers.ct_series import open_ct
@@ -105,14 +105,6 @@ class TestFiles:
         assert ct.read((slice(0, 2),) * 3).shape == (2, 2, 2)
         monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=needed))
         assert ct.read().size == needed / 5
-
-
-class TestNifti:
-    def test_conflict_by_a_few_voxels(self, tmp_path):
-        shifted = affine_of(noise())
-        shifted[0, 3] += 2
-        path = nifti(tmp_path / "a.nii", noise(), [("s", 2), ("q", 1)], affines=[affine_of(noise()), shifted])
-        np.testing.assert_allclose(open_ct(path).grid.origin, (RAS @ shifted)[:3, 3], atol=1e-3)
 
 
 class TestGrid:

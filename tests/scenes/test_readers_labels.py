@@ -25,7 +25,7 @@ from scenes.volumes.voxel_grid import VoxelGrid
 NAMES = {
     "kidney_left": ("kidney", "left"), "kidney_right": ("kidney", "right"), "Kidney L": ("kidney", "left"),
     "Left Kidney": ("kidney", "left"), "Right_Kidney_1": ("kidney", "right"), "kidneyR": ("kidney", "right"),
-    "Rt Kidney": ("kidney", "right"), "Kidneys": ("kidney", None), "both kidneys": ("kidney", None),
+    "Rt Kidney": ("kidney", "right"), "Kidneys": ("kidney", None), "both kidneys": ("kidney", None), "left and right kidney": ("kidney", None),
     "Niere links": ("kidney", "left"), "Niere rechts": ("kidney", "right"), "Rein gauche": ("kidney", "left"),
     "left renal mass": ("tumour", "left"), "GTV": ("tumour", None), "GTV_L": ("tumour", "left"),
     "Renal Tumor": ("tumour", None), "tumour": ("tumour", None), "ccRCC right": ("tumour", "right"),

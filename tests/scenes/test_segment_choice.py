@@ -281,12 +281,6 @@ class TestUnknown:
         named = import_request(ct, labels, tissues={"tumour": [name]})
         assert named.tumour is not None and not any("no known tissue" in line for line in named.warnings)
 
-    @pytest.mark.parametrize("form", ["folder", "Slicer"])
-    def test_known_words_are_the_tumour(self, tmp_path, form):
-        ct, labels = self.write(tmp_path, unicodedata.normalize("NFD", "Läsion"), form)
-        patient = import_request(ct, labels)
-        np.testing.assert_allclose(patient.tumour.center_mass, TUMOUR[0], atol=2)
-
     @pytest.mark.parametrize(("name", "lines"), [("Renal_Fascia_L", 0), ("ROI_1", 1)])
     def test_what_is_around_the_organ_is_not_in_it(self, tmp_path, name, lines):
         """What is known there needs no warning."""
@@ -297,16 +291,6 @@ class TestUnknown:
         sitk.WriteImage(around, str(labels[0] / f"{name}.nii.gz"))
         warnings = [line for line in import_request(ct, labels).warnings if f"“{name}”" in line]
         assert len(warnings) == lines and all("touches the organ" in line for line in warnings)
-
-    def test_far_from_the_organ_there_is_none(self, tmp_path):
-        ct, labels = self.write(tmp_path, "nodule", "folder")
-        image = sitk.ReadImage(str(ct))
-        far = sitk.GetImageFromArray(
-            (level(points_of(image), (RIGHT[0], np.full(3, 20.0))) < 0).astype(np.uint8)
-        )
-        far.CopyInformation(image)
-        sitk.WriteImage(far, str(labels[0] / "ROI_1.nii.gz"))
-        assert not any("no known tissue" in line for line in import_request(ct, labels).warnings)
 
 
 def test_no_tissue_remains_of_what_is_left_out():

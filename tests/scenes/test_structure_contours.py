@@ -190,16 +190,6 @@ class TestSolids:
         # Small sections at the ends, which share little, are united.
         assert millilitres(one) == pytest.approx(millilitres(plain), rel=0.05)
 
-    def test_the_larger_one_counts(self, tmp_path):
-        for contours in (BALL + inset(BALL, 2.0), inset(BALL, 2.0) + BALL):
-            one, (note,) = single(tmp_path, grid_of(3.0), contours)
-            drawn = len(inset(BALL, 2.0))
-            assert note == (
-                f"region 1: contours that stand twice in a plane, counted once: {drawn}; {drawn} of them "
-                "differ, and the larger one counts"
-            )
-            assert millilitres(one) == pytest.approx(millilitres(single(tmp_path, grid_of(3.0), BALL)[0]))
-
     @pytest.mark.parametrize("radius", [12.0, 25.0])
     @pytest.mark.parametrize("turn", [1, -1])
     def test_a_hole_of_half_the_area(self, tmp_path, radius, turn):
@@ -243,19 +233,6 @@ class TestStrokes:
         one, notes = single(tmp_path, grid_of(3.0), row_of_boxes(count, overlap), name)
         assert notes == [f"region 1: contours that overlap in a plane, united: {2 * count}"]
         assert one.values.all() and one.values.sum() == 2 * 20 * (10 * count - (count - 1) * overlap)
-
-    @pytest.mark.parametrize("share", [0.3, 0.9])
-    def test_leave_no_slit(self, tmp_path, share):
-        """Edges on both sides of a line of pixels."""
-        contours = [
-            c for z in (6.0, 9.0) for c in (box(z, (10.5, 10.5), (20 + share / 2, 30.5)), box(z, (20 - share / 2, 10.5), (30.5, 30.5)))
-        ]  # fmt: skip
-        one, _ = single(tmp_path, grid_of(3.0), contours)
-        assert one.values.all() and one.values.sum() == 2 * 20 * 20
-
-    def test_exclusive_contours(self, tmp_path):
-        one, notes = single(tmp_path, grid_of(3.0), row_of_boxes(3, 3), kind="CLOSEDPLANAR_XOR")
-        assert notes == [] and one.values.sum() == 2 * 20 * (3 * 10 - 4 * 3)
 
     @pytest.mark.parametrize("name", ["Kidney", "aorta"])
     def test_have_holes(self, tmp_path, name):
@@ -370,17 +347,6 @@ class TestTypes:
     def test_closed(self, tmp_path, kind):
         one, _ = single(tmp_path, grid_of(3.0), [loop(6.0, 9.0), loop(9.0, 9.0)], kind=kind)
         assert one.values.any(axis=(1, 2)).sum() == 2
-
-    def test_interpolated_slices_are_of_the_region(self, tmp_path):
-        """Some planning systems mark what they interpolate."""
-
-        def edit(data):
-            for contour in data.ROIContourSequence[0].ContourSequence[1::2]:
-                contour.ContourGeometricType = "INTERPOLATED_PLANAR"
-
-        contours = [loop(3.0 * k, 9.0) for k in range(2, 8)]
-        one, notes = single(tmp_path, grid_of(3.0), contours, edit=edit)
-        assert planes_of(one, grid_of(3.0)) == list(range(2, 8)) and notes == []
 
     @pytest.mark.parametrize("kind", ["POINT", "OPEN_PLANAR"])
     def test_without_a_closed_contour(self, tmp_path, kind):
@@ -507,9 +473,12 @@ class TestPlanes:
         """Its slices are unevenly spaced: contours stand at them, not at the planes of its grid."""
         positions = np.concatenate([[0.0], np.cumsum(np.resize(gaps, int(112 / np.mean(gaps))))])
         series = Series(
-            tmp_path / "ct", np.eye(3), size=(90, 70, len(positions)), positions=lambda k: np.array([0, 0, positions[int(k)]])
-        )  # fmt: skip
-        series.spacing = (1.0, 1.0)
+            tmp_path / "ct",
+            np.eye(3),
+            size=(90, 70, len(positions)),
+            spacing=(1.0, 1.0),
+            positions=lambda k: np.array([0, 0, positions[int(k)]]),
+        )
         ct = open_ct(series.write())
         assert any("resampled" in note for note in ct.notes)
         contours = spheroid(positions, self.MIDDLE, self.WIDTH, self.LENGTH)

@@ -24,15 +24,24 @@ def made(*given) -> tuple[Abdomen, TissueMap]:
 def recall(body: Abdomen, found: TissueMap, structure: str, *tissues: str, where=None) -> float:
     """The share of a structure's voxels that have one of some tissues."""
     mask = body.truth == structure if where is None else (body.truth == structure) & where
-    factors = np.array(found.codes.shape) // mask.shape
-    for axis, factor in enumerate(factors):
+    return float(found.mask(*tissues)[on_finer(mask, found)].mean())
+
+
+def places(shape: tuple[int, ...], index_from_mm: np.ndarray) -> np.ndarray:
+    """LPS [mm] of voxels, (nx, ny, nz, 3)."""
+    index = np.moveaxis(np.indices(shape), 0, -1)
+    return (index - index_from_mm[:3, 3]) @ np.linalg.inv(index_from_mm[:3, :3]).T
+
+
+def on_finer(mask: np.ndarray, found: TissueMap) -> np.ndarray:
+    """A mask of a CT's voxels on the grid of its tissues."""
+    for axis, factor in enumerate(np.array(found.codes.shape) // mask.shape):
         mask = mask.repeat(factor, axis)
-    return float(found.mask(*tissues)[mask].mean())
+    return mask
 
 
 def away_from_wall(body: Abdomen) -> np.ndarray:
-    index = np.moveaxis(np.indices(body.truth.shape), 0, -1)
-    at = (index - body.index_from_mm[:3, 3]) @ np.linalg.inv(body.index_from_mm[:3, :3]).T
+    at = places(body.truth.shape, body.index_from_mm)
     return np.hypot(at[..., 0] / 165, at[..., 1] / 110) < 0.79
 
 
@@ -116,14 +125,11 @@ def test_marrow_as_bright_as_arteries_is_bone():
 def test_contrast_agent_in_the_bowel_away_from_the_spine_is_no_artery():
     # As long as the CT, as a descending colon is.
     body = abdomen("left", True)
-    index = np.moveaxis(np.indices(body.truth.shape), 0, -1)
-    at = (index - body.index_from_mm[:3, 3]) @ np.linalg.inv(body.index_from_mm[:3, :3]).T
+    at = places(body.truth.shape, body.index_from_mm)
     colon = np.hypot(at[..., 0] - 70, at[..., 1] + 40) < 12
     hu = np.where(colon, 400, body.hu)
     found = tissue_map(hu, body.labels, body.organ, body.index_from_mm)
-    factors = np.array(found.codes.shape) // colon.shape
-    for axis, factor in enumerate(factors):
-        colon = colon.repeat(factor, axis)
+    colon = on_finer(colon, found)
     # Its rim has the HU of blood by partial volume.
     assert found.mask("bowel")[colon].mean() > 0.8 and found.mask("vessel")[colon].mean() < 0.1
 
@@ -140,8 +146,7 @@ def test_the_gallbladder_is_fluid(enhanced):
 @pytest.mark.parametrize("side, enhanced", SIDES)
 def test_parenchyma_is_within_the_surface_and_nothing_of_the_surroundings_in_it(side, enhanced):
     body, found = made(side, enhanced)
-    index = np.moveaxis(np.indices(found.codes.shape), 0, -1)
-    at = (index - found.index_from_mm[:3, 3]) @ np.linalg.inv(found.index_from_mm[:3, :3]).T
+    at = places(found.codes.shape, found.index_from_mm)
     away = np.linalg.norm((at - body.organ.center_mass) / (np.ptp(body.organ.vertices, axis=0) / 2), axis=-1)
     parenchyma = found.mask("kidney", "cortex", "medulla")
     # The surface's grid of 2 mm is right to 0.1 mm about an ellipsoid of 20 mm or more: half a percent of its
@@ -212,13 +217,6 @@ def test_on_a_real_unenhanced_ct_nearly_all_of_liver_and_spleen_are_found(data, 
     labels = np.where(voxels[1] == kidney, CODE["kidney"], 0).astype(np.uint8)
     found = tissue_map(voxels[0], labels, surface, np.linalg.inv(mm_from_index))
     # Of each voxel of the organ, those of the finer grid.
-    own = (
-        sitk.GetArrayFromImage(sitk.Resample(truth, ct, interpolator=sitk.sitkNearestNeighbor)).transpose(
-            2, 1, 0
-        )
-        > 0
-    )
-    factors = np.array(found.codes.shape) // own.shape
-    for axis, factor in enumerate(factors):
-        own = own.repeat(factor, axis)
+    near = sitk.Resample(truth, ct, interpolator=sitk.sitkNearestNeighbor)
+    own = on_finer(sitk.GetArrayFromImage(near).transpose(2, 1, 0) > 0, found)
     assert own.sum() > 1000 and found.mask(organ)[own].mean() > 0.9

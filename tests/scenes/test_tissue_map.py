@@ -152,13 +152,6 @@ def test_fat_in_the_hollow_is_sinus_and_fat_around_the_kidney_is_not(level):
     assert not found.mask("sinus")[outside].any() and found.mask("fat")[outside & (AT[..., 0] > 0)].all()
 
 
-def test_contrast_agent_in_the_collecting_system_is_urine_and_a_stone_needs_a_plain_ct():
-    agent = ball(6.0, 0.0, 0.0, 4.0)
-    for level, kind, other in ((ENHANCED, "urine", "stone"), (PLAIN, "stone", "urine")):
-        found = found_in(scene(level, agent=(agent, level + 300)))
-        assert found.mask(kind)[agent].all() and not found.mask(other).any()
-
-
 def test_small_stones_remain():
     stone = ball(8.0, 2.0, 10.0, 1.1)
     assert stone.sum() < 12
