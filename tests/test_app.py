@@ -72,11 +72,11 @@ def run(*arguments, **environment) -> subprocess.CompletedProcess:
 
 def refused(*arguments) -> str:
     """The one line with which a command is refused."""
-    told = io.StringIO()
-    with redirect_stderr(told):
+    errors = io.StringIO()
+    with redirect_stderr(errors):
         status = app.main([str(argument) for argument in arguments])
-    lines = told.getvalue().strip().splitlines()
-    assert status == 2 and len(lines) == 1 and lines[0].startswith("nephron: "), told.getvalue()
+    lines = errors.getvalue().strip().splitlines()
+    assert status == 2 and len(lines) == 1 and lines[0].startswith("nephron: "), errors.getvalue()
     return lines[0]
 
 
@@ -317,16 +317,16 @@ def types(group: click.Group) -> Iterator[click.ParamType]:
         command = group.get_command(context, name)
         if isinstance(command, click.Group):
             yield from types(command)
-        yield from (each.type for each in command.params)
+        yield from (option.type for option in command.params)
 
 
 def test_no_range_of_numbers_lets_one_through_that_is_none():
-    found = [each for each in types(app.cli) if isinstance(each, click.FloatRange)]
-    assert len(found) > 20
-    for each in found:
+    ranges = [number for number in types(app.cli) if isinstance(number, click.FloatRange)]
+    assert len(ranges) > 20
+    for number in ranges:
         for word in ("nan", "inf", "-inf"):
             with pytest.raises(click.BadParameter):
-                each.convert(word, None, None)
+                number.convert(word, None, None)
 
 
 @pytest.mark.parametrize(
@@ -339,16 +339,16 @@ def test_the_list_of_commands_has_each_commands_own_first_sentence(table, name):
 
 
 def test_help_comes_without_the_libraries_that_take_seconds():
-    asked = (
+    code = (
         "import sys, app; app.main(['--help']); print({'taichi', 'trimesh', 'matplotlib', 'pydantic'} & "
         "set(sys.modules))"
     )
-    done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, cwd=ROOT)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.stdout.strip().endswith("set()"), done.stdout
 
 
 def test_numbers_have_everyday_names_in_the_help():
-    named = {each.name for each in types(app.cli)}
+    named = {option.name for option in types(app.cli)}
     assert {"number", "integer"} <= named and not [
         name for name in named if "float" in name or "range" in name
     ]

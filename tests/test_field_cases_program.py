@@ -33,7 +33,7 @@ GERMAN = ";".join(POSE)
 
 def refused(capsys, *arguments) -> str:
     """The one line with which a command line is refused, in words."""
-    assert app.main([str(each) for each in arguments]) == 2
+    assert app.main([str(argument) for argument in arguments]) == 2
     line = capsys.readouterr().err.strip()
     assert line.startswith("nephron: ") and "\n" not in line
     assert not PYTHONS.search(line), line
@@ -72,8 +72,8 @@ def test_the_command_that_is_printed_can_be_pasted():
     folder = b"Pat\xe9 1"
     shown = shell_command("rehearse", Path(os.fsdecode(folder))).encode("utf-8", "backslashreplace")
     words = shown.split(b" rehearse ", 1)[1]
-    given = subprocess.run(["bash", "-c", b"printf %s " + words], capture_output=True, check=True).stdout
-    assert given == folder
+    printed = subprocess.run(["bash", "-c", b"printf %s " + words], capture_output=True, check=True).stdout
+    assert printed == folder
 
 
 def test_a_file_name_that_is_too_long_is_named_itself(tmp_path):

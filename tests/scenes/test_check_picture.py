@@ -215,8 +215,8 @@ def test_the_whole_width_is_shown_where_it_is_wider_than_the_cuts(patient, pictu
     """Else the surface is shown once more: below the middle it is shaded, and has no grey in it."""
     assert is_wider(patient.overview, patient.ct) and not is_wider(patient.ct, patient.ct)
     panels = [
-        each[560:, 460:840]
-        for each in (picture, drawn_check(replace(patient, overview=patient.ct), tmp_path))
+        image[560:, 460:840]
+        for image in (picture, drawn_check(replace(patient, overview=patient.ct), tmp_path))
     ]
     wide, narrow = (((np.ptp(panel, axis=2) < 0.01) & (panel[..., 0] > 0.3)).sum() for panel in panels)
     assert wide > 20 * narrow
@@ -225,7 +225,7 @@ def test_the_whole_width_is_shown_where_it_is_wider_than_the_cuts(patient, pictu
 def test_long_text_ends_above_the_names_of_the_colours(patient, picture, tmp_path):
     """The text is white, the names are not."""
     rows = [("WARNING", "a warning of several lines, with what to do " * 5)] * 4 + summary_rows(patient)
-    panels = [each[500:, 860:] for each in (drawn_check(patient, tmp_path, rows), picture)]
+    panels = [image[500:, 860:] for image in (drawn_check(patient, tmp_path, rows), picture)]
     long, short = (np.flatnonzero((panel.min(axis=2) > 0.75).any(axis=1)) for panel in panels)
     # The first name is 370 pixels below the middle of the picture.
     assert long.max() < 368 and short.max() < 368 and len(long) > len(short)

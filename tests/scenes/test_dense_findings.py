@@ -60,10 +60,12 @@ def bare_of(spacing, labelled) -> TissueMap:
 
 def shown(spacing, kidney_hu, bright, labelled) -> dict[str, float]:
     """Volumes [ml] of what the tissue map shows, but for what is labelled so."""
-    found = mapped(*made(spacing, kidney_hu, bright, labelled))
+    classes = mapped(*made(spacing, kidney_hu, bright, labelled))
     bare = bare_of(spacing, None if labelled is None else tuple(map(tuple, labelled)))
-    ml = float(np.prod(np.linalg.norm(np.linalg.inv(found.index_from_mm[:3, :3]), axis=0)) / 1000)
-    return {each: ml * float((found.mask(each) & ~bare.mask(each)).sum()) for each in ("urine", "stone")}
+    ml = float(np.prod(np.linalg.norm(np.linalg.inv(classes.index_from_mm[:3, :3]), axis=0)) / 1000)
+    return {
+        tissue: ml * float((classes.mask(tissue) & ~bare.mask(tissue)).sum()) for tissue in ("urine", "stone")
+    }
 
 
 @pytest.mark.parametrize("spacing", [THIN, THICK], ids=["thin", "thick"])

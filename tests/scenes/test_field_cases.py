@@ -48,10 +48,10 @@ def coarse(monkeypatch):
 
 
 def hounsfield(places, anatomy=ANATOMY):
-    found = np.full(places.shape[:-1], -1000.0)
+    values = np.full(places.shape[:-1], -1000.0)
     for value, solid in anatomy:
-        found[level(places, solid) < 0] = value
-    return found
+        values[level(places, solid) < 0] = value
+    return values
 
 
 def scan(spacing=(4.0, 4.0, 4.0), anatomy=ANATOMY, direction=DIRECTIONS["identity"]):

@@ -27,10 +27,10 @@ SIZE = (176, 121, 36)
 
 def hounsfield(places):
     """HU of the synthetic body, with a spine."""
-    found = np.full(places.shape[:-1], -1000.0)
+    values = np.full(places.shape[:-1], -1000.0)
     for value, solid in ((40, BODY), (500, SPINE), (120, LEFT), (120, RIGHT), (70, TUMOUR)):
-        found[level(places, solid) < 0] = value
-    return found
+        values[level(places, solid) < 0] = value
+    return values
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -99,15 +99,15 @@ def test_the_folder_is_a_scene(written):
 
 
 def test_the_findings_are_kept(written, taken_in):
-    patient, found = taken_in, read_findings(written)
-    assert found.side == "left" and found.series == "1" and not found.draft
-    assert found.source.size == SIZE and found.ct.size == patient.ct.GetSize()
-    np.testing.assert_allclose(found.source.origin_mm, ORIGIN, atol=1e-3)
-    assert found.surfaces["organ"].label_ml == pytest.approx(patient.volumes_ml["organ"], abs=1e-3)
-    assert found.surfaces["tumour"].volume_ml == pytest.approx(patient.tumour.volume / 1000, abs=1e-3)
-    assert found.length_mm == pytest.approx(2 * LEFT[1][2], abs=3.5)
-    assert found.complexity["tumours"] == 1
-    assert list(found.open_warnings) == list(patient.warnings) and found.notes == patient.notes
+    patient, findings = taken_in, read_findings(written)
+    assert findings.side == "left" and findings.series == "1" and not findings.draft
+    assert findings.source.size == SIZE and findings.ct.size == patient.ct.GetSize()
+    np.testing.assert_allclose(findings.source.origin_mm, ORIGIN, atol=1e-3)
+    assert findings.surfaces["organ"].label_ml == pytest.approx(patient.volumes_ml["organ"], abs=1e-3)
+    assert findings.surfaces["tumour"].volume_ml == pytest.approx(patient.tumour.volume / 1000, abs=1e-3)
+    assert findings.length_mm == pytest.approx(2 * LEFT[1][2], abs=3.5)
+    assert findings.complexity["tumours"] == 1
+    assert list(findings.open_warnings) == list(patient.warnings) and findings.notes == patient.notes
 
 
 def test_nothing_names_the_patient(written, hospital):

@@ -70,8 +70,8 @@ def test_without_what_is_not_needed(series, masks, tmp_path, kind):
         for name in names:
             without([data], name.split("."))
         save(data, tmp_path / "less.dcm")
-        found = by_name(open_labels(tmp_path / "less.dcm").maps(None), ct_grid(series))
-        assert all(np.array_equal(found[name], mask > 0) for name, mask in masks.items()), names
+        labelled = by_name(open_labels(tmp_path / "less.dcm").maps(None), ct_grid(series))
+        assert all(np.array_equal(labelled[name], mask > 0) for name, mask in masks.items()), names
 
 
 @pytest.mark.parametrize("name", ["Rows", "SegmentationType", "SegmentSequence.SegmentNumber"])
@@ -87,8 +87,8 @@ def test_any_numbers(series, masks, tmp_path, kind, by):
     """Segment 0 is a segment as the others are, under its own number."""
     path = write_segmentation(tmp_path / "seg.dcm", series, masks, kind)
     edited(path, lambda data: renumber(data, by))
-    found = by_name(open_labels(path).maps(None), ct_grid(series))
-    assert all(np.array_equal(found[name], mask > 0) for name, mask in masks.items())
+    labelled = by_name(open_labels(path).maps(None), ct_grid(series))
+    assert all(np.array_equal(labelled[name], mask > 0) for name, mask in masks.items())
     assert values_of(path) == {"Kidney": 1 + by, "renal mass": 2 + by}
 
 
@@ -97,8 +97,8 @@ def test_one_segment_that_no_frame_names(series, masks, tmp_path, kind):
     path = write_segmentation(tmp_path / "seg.dcm", series, {"Kidney": masks["Kidney"]}, kind)
     for sequence in ("SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence"):
         edited(path, lambda data, at=sequence: without([data], [at, "SegmentIdentificationSequence"]))
-    found = by_name(open_labels(path).maps(None), ct_grid(series))
-    assert np.array_equal(found["Kidney"], masks["Kidney"] > 0)
+    labelled = by_name(open_labels(path).maps(None), ct_grid(series))
+    assert np.array_equal(labelled["Kidney"], masks["Kidney"] > 0)
 
 
 def with_background(path, label, padding):

@@ -44,9 +44,9 @@ def references(text):
     ],
 )  # fmt: skip
 def test_what_belongs_to_a_ct(labels, fault, doubt):
-    found = references(labels)
-    assert (fault in mismatch(found, CT)) and bool(fault) == bool(mismatch(found, CT))
-    notes = () if fault else doubts(found, CT)
+    refers = references(labels)
+    assert (fault in mismatch(refers, CT)) and bool(fault) == bool(mismatch(refers, CT))
+    notes = () if fault else doubts(refers, CT)
     assert bool(notes) == bool(doubt) and doubt in " ".join(notes)
 
 
@@ -264,10 +264,10 @@ class TestLabelsBesideTheCt:
     @pytest.fixture
     def requested(self, monkeypatch):
         """The CT and the labels that a request reads."""
-        found = []
+        volumes = []
 
         def stop(volume, *_, **__):
-            found.append(volume)
+            volumes.append(volume)
             raise PatientError("read")
 
         monkeypatch.setattr("scenes.patients.import_request.import_patient", stop)
@@ -275,7 +275,7 @@ class TestLabelsBesideTheCt:
         def request(*arguments, **options):
             with pytest.raises(PatientError, match="^read$"):
                 import_request(*arguments, **options)
-            return found[-1]
+            return volumes[-1]
 
         return request
 

@@ -63,13 +63,13 @@ class TestFilled:
     @pytest.mark.parametrize("count", [1, 2])
     def test_the_organ_and_its_tumour(self, thick, count):
         k = middle(thick[1], TUMOUR)
-        found, warnings = fill_missing_slices(without(thick[1], range(k, k + count)), ORGAN)
+        filled, warnings = fill_missing_slices(without(thick[1], range(k, k + count)), ORGAN)
         whole = sitk.GetArrayFromImage(thick[1])
         for slices in range(k, k + count):
-            differ = (found.values[slices] > 0) != (whole[slices] > 0)
+            differ = (filled.values[slices] > 0) != (whole[slices] > 0)
             # Between two sections of an ellipsoid there is more of it than between their outlines.
             assert differ.sum() < 0.1 * count * (whole[slices] > 1).sum()
-        assert np.array_equal(found.values[: k - 1], whole[: k - 1])
+        assert np.array_equal(filled.values[: k - 1], whole[: k - 1])
         names = [warning for warning in warnings if "no kidney is labelled in the slice" in warning]
         z = [VoxelGrid.of(thick[1]).place([[0, 0, n]])[0, 2] for n in range(k, k + count)]
         assert len(names) == 1 and all(f"z {one:.1f} mm (around x " in names[0] for one in z)
@@ -78,10 +78,10 @@ class TestFilled:
     @pytest.mark.parametrize("above", [0, 7], ids=["middle", "pole"])
     def test_a_slice_that_the_tumour_bridges(self, thick, above):
         k = middle(thick[1]) + above
-        found, (warning,) = fill_missing_slices(without(thick[1], [k], keep=(3,)), ORGAN)
+        filled, (warning,) = fill_missing_slices(without(thick[1], [k], keep=(3,)), ORGAN)
         z = VoxelGrid.of(thick[1]).place([[0, 0, k]])[0, 2]
         assert f"z {z:.1f} mm (around x " in warning and "no kidney" in warning
-        (piece,) = [p for p in find_organs(found, ORGAN) if p.centre_x_mm > 0]
+        (piece,) = [p for p in find_organs(filled, ORGAN) if p.centre_x_mm > 0]
         (whole,) = [p for p in find_organs(label_map(thick[1]), ORGAN) if p.centre_x_mm > 0]
         assert piece.volume_ml == pytest.approx(whole.volume_ml, rel=0.01)
 
@@ -96,11 +96,11 @@ class TestFilled:
         voxels[narrow] = 0
         voxels[narrow, 10:30, 4:36] = 1 if is_first else 2
         grid = VoxelGrid((40, 40, 9), np.array([1.0, 1.0, 4.0]), np.zeros(3), np.eye(3))
-        found, warnings = fill_missing_slices(
+        filled, warnings = fill_missing_slices(
             LabelMap.valued(grid, voxels, {1: "cortex", 2: "medulla"}), ORGAN
         )
         assert "z 16.0 mm" in warnings[0]
-        between = found.values[4]
+        between = filled.values[4]
         assert (between[12:28, 8:32] == 1).all()
         rim = between[np.r_[6:9, 31:34]][:, 8:32]
         assert rim.any() and set(np.unique(rim)) <= {0, 2 if is_first else 1}
@@ -119,17 +119,17 @@ class TestFilled:
         heights = points_of(image)[:, 0, 0, 2]
         missing = np.flatnonzero((heights > 0) & (heights < TUMOUR[0][2] - TUMOUR[1][2]))
         assert len(missing) == 2
-        found, _ = fill_missing_slices(without(image, missing), ORGAN)
-        assert (found.values == 3).sum() == (sitk.GetArrayFromImage(image) == 3).sum()
-        assert (found.values[missing] == 2).any(axis=(1, 2)).all()
+        filled, _ = fill_missing_slices(without(image, missing), ORGAN)
+        assert (filled.values == 3).sum() == (sitk.GetArrayFromImage(image) == 3).sum()
+        assert (filled.values[missing] == 2).any(axis=(1, 2)).all()
 
     def test_a_tumour_alone(self, thick):
         voxels = sitk.GetArrayFromImage(thick[1])
         k = middle(thick[1], TUMOUR)
         voxels[k][voxels[k] == 3] = 2
-        found, (warning,) = fill_missing_slices(label_map(thick[1], voxels), ORGAN)
+        filled, (warning,) = fill_missing_slices(label_map(thick[1], voxels), ORGAN)
         assert "no tumour is labelled in the slice z" in warning
-        assert (found.values[k] == 3).sum() == pytest.approx(
+        assert (filled.values[k] == 3).sum() == pytest.approx(
             (sitk.GetArrayFromImage(thick[1])[k] == 3).sum(), rel=0.25
         )
 
@@ -137,10 +137,10 @@ class TestFilled:
     def test_along_any_axis_also_of_slices_thinner_than_pixels(self, axis, thickness):
         _, labels = body(spacing=(3.0, 3.0, thickness))
         k = int(np.rint(VoxelGrid.of(labels).index(LEFT[0][None])[0, axis]))
-        found, warnings = fill_missing_slices(without(labels, [k], axis), ORGAN)
+        filled, warnings = fill_missing_slices(without(labels, [k], axis), ORGAN)
         place = VoxelGrid.of(labels).place(np.full((1, 3), k))[0, axis]
         assert f"{'xyz'[axis]} {place:.1f} mm" in " ".join(warnings)
-        plane = np.moveaxis(found.values, 2 - axis, 0)[k]
+        plane = np.moveaxis(filled.values, 2 - axis, 0)[k]
         assert (plane == 2).any()
 
     @pytest.mark.parametrize(
@@ -158,14 +158,14 @@ class TestFilled:
         normal, along = grid.direction[:, axis], LEFT[1] ** 2 * grid.direction[:, axis]
         away = (grid.place(np.full(3, k)) - LEFT[0]) @ normal
         x, y, z = LEFT[0] + away * along / (along @ normal)
-        found = re.search(r"z (-?[\d.]+) mm \(around x (-?\d+), y (-?\d+)\)", warning).groups()
+        place = re.search(r"z (-?[\d.]+) mm \(around x (-?\d+), y (-?\d+)\)", warning).groups()
         # Its pixels are counted to a part of one, of 2 x 3 mm.
-        assert np.array(found, float) == pytest.approx([z, x, y], abs=1.0)
+        assert np.array(place, float) == pytest.approx([z, x, y], abs=1.0)
 
 
 def assert_left(labels, organ):
-    found, warnings = fill_missing_slices(labels, organ)
-    assert found is labels and warnings == ()
+    filled, warnings = fill_missing_slices(labels, organ)
+    assert filled is labels and warnings == ()
 
 
 class TestLeft:

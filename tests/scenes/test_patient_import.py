@@ -45,8 +45,8 @@ LIVER = np.array([20.0, 0.0, 40.0]), np.array([20.0, 20.0, 20.0])
 def label_map(labels, organ=(), **tissues):
     """A label map with assigned tissues, and the values of its organ or None."""
     words = {tissue: [str(v) for v in values] for tissue, values in tissues.items()}
-    (told_map,) = assign_tissues([LabelMap.of(labels)], [str(v) for v in organ], words)
-    return told_map, list(organ) or None
+    (assigned,) = assign_tissues([LabelMap.of(labels)], [str(v) for v in organ], words)
+    return assigned, list(organ) or None
 
 
 def imported(ct, labels, organ=(), side=None, margin_mm=60.0, **tissues):
@@ -54,7 +54,7 @@ def imported(ct, labels, organ=(), side=None, margin_mm=60.0, **tissues):
     return import_patient(LazyVolume.of(ct), *labelled, side, margin_mm, given=tissues)
 
 
-def found(ct, labels, organ=(), side=None, **tissues):
+def organ_taken(ct, labels, organ=(), side=None, **tissues):
     """The organ that an import would take, and its side."""
     pieces = find_organs(*label_map(labels, organ, **tissues))
     midline = midline_x(VoxelGrid.of(ct), sitk.GetArrayFromImage(ct), -1000, 1000)
@@ -115,16 +115,16 @@ class TestImport:
     @pytest.mark.parametrize(("value", "side"), [(1, "right"), (2, "left")])
     def test_tells_left_from_right(self, direction, value, side):
         ct, labels = body(direction, spacing=(4.0, 3.5, 5.0))
-        assert found(ct, labels, [value])[1] == side
-        both = found(ct, labels, side=side, tumour=[3] if value == 2 else [])[0]
+        assert organ_taken(ct, labels, [value])[1] == side
+        both = organ_taken(ct, labels, side=side, tumour=[3] if value == 2 else [])[0]
         assert both.names[0] == str(value)
         only_one = mapped(labels, [0, value == 1, value == 2, value == 2])
-        assert found(ct, only_one)[1] == side
+        assert organ_taken(ct, only_one)[1] == side
         both_one_value = mapped(labels, [0, 1, 1, 1])
-        organ, told_side = found(ct, both_one_value, side=side)
-        assert told_side == side and np.sign(organ.centre_x_mm) == (1 if side == "left" else -1)
+        organ, side_taken = organ_taken(ct, both_one_value, side=side)
+        assert side_taken == side and np.sign(organ.centre_x_mm) == (1 if side == "left" else -1)
         with pytest.raises(PatientError, match="no (left|right) kidney"):
-            found(ct, only_one, side="left" if side == "right" else "right")
+            organ_taken(ct, only_one, side="left" if side == "right" else "right")
 
     def test_parts_of_the_organ_keep_their_tissue(self, coarse, ct_and_labels):
         ct, labels = ct_and_labels
@@ -149,8 +149,8 @@ class TestImport:
         ct, labels = ct_and_labels
         near = [slice(ct.TransformPhysicalPointToIndex((30.0, 0, 0))[0], None), slice(None), slice(None)]
         with pytest.raises(PatientError, match="--side left or --side right"):
-            found(ct[near], labels[near], [2])
-        assert found(ct[near], labels[near], [2], "left")[1] == "left"
+            organ_taken(ct[near], labels[near], [2])
+        assert organ_taken(ct[near], labels[near], [2], "left")[1] == "left"
 
     def test_names_tell_the_side_and_are_checked(self, coarse, ct_and_labels):
         ct, labels = ct_and_labels

@@ -120,19 +120,19 @@ def test_the_side_of_a_decubitus_position_is_down():
 
 
 def test_the_option_has_four_words_and_reaches_the_import(tmp_path, capfd, monkeypatch):
-    asked = {}
+    arguments = {}
 
     def request(*values, **named):
-        asked.update(inspect.signature(import_request).bind(*values, **named).arguments)
+        arguments.update(inspect.signature(import_request).bind(*values, **named).arguments)
         raise PatientError("enough")
 
     monkeypatch.setattr("scenes.patients.import_request.import_request", request)
     command = ["import", "ct", "labels", "--out", str(tmp_path / "p"), "--position"]
-    assert main([*command, "left"]) == 2 and not asked
+    assert main([*command, "left"]) == 2 and not arguments
     printed = capfd.readouterr().err
     assert all(position in printed for position in POSITIONS)
     assert main([*command, "left-decubitus"]) == 2
-    assert asked["position"] == "left-decubitus" and asked["seed_mm"] is None
+    assert arguments["position"] == "left-decubitus" and arguments["seed_mm"] is None
 
 
 class Trunk:

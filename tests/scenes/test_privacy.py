@@ -30,13 +30,13 @@ def coarse():
 
 def contents(folder: Path) -> bytes:
     """All bytes of a folder's files, with voxels and pictures decompressed."""
-    found = []
+    parts = []
     for file in sorted(folder.iterdir()):
         head, _, packed = file.read_bytes().partition(b"\n\n")
-        found.append(
+        parts.append(
             head + zlib.decompress(packed, wbits=31) if file.suffix == ".nrrd" else file.read_bytes()
         )
-    return b"\n".join(found)
+    return b"\n".join(parts)
 
 
 def in_any_encoding(text: str) -> set[bytes]:
@@ -49,9 +49,9 @@ def from_dicom(folder: Path) -> list[Path]:
     """
 
     def hounsfield(places):
-        found = np.where(level(places, (np.zeros(3), np.array([160.0, 110.0, 400.0]))) < 0, 40.0, -1000.0)
-        found[level(places, LEFT) < 0] = 120
-        return found
+        values = np.where(level(places, (np.zeros(3), np.array([160.0, 110.0, 400.0]))) < 0, 40.0, -1000.0)
+        values[level(places, LEFT) < 0] = 120
+        return values
 
     def edit(data, _=None):
         inner = Dataset()
@@ -113,7 +113,7 @@ def test_no_file_names_the_patient_and_no_sentence_is_garbled(source, shown, tmp
     everything = contents(out)
     for text in (*TEXTS, *PERSON.values(), "Long", str(tmp_path)):
         if len(text) > 3:
-            assert not any(each in everything for each in in_any_encoding(text)), text
+            assert not any(encoded in everything for encoded in in_any_encoding(text)), text
     assert "mm long" in terminal or "length" in terminal
     assert "removed" not in terminal
     findings = json.loads((out / "import.json").read_text("utf-8"))

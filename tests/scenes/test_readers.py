@@ -387,8 +387,8 @@ def damage(kind, folder):
         for _ in range(CASES):
             target.write_bytes(damaged(good, chance))
             try:
-                found = read(path)
-                found.hounsfield() if read is open_ct else found.maps(grid)
+                read_back = read(path)
+                read_back.hounsfield() if read is open_ct else read_back.maps(grid)
             except PatientError as error:
                 if not str(error).isprintable():
                     faults.add(f"{target.name}: several lines")

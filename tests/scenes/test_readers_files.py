@@ -123,6 +123,6 @@ class TestGrid:
         low, high = np.array([-20.3, -11.1, -7.7]), np.array([10.4, 15.2, 9.9])
         box = grid.box_around(low, high)
         places = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
-        found, first, last = grid.index(places), [a.start for a in box], [a.stop - 1 for a in box]
-        assert ((found >= first) & (found <= last)).all()
-        assert (found.min(axis=0) - first < 1).all() and (last - found.max(axis=0) < 1).all()
+        indices, first, last = grid.index(places), [a.start for a in box], [a.stop - 1 for a in box]
+        assert ((indices >= first) & (indices <= last)).all()
+        assert (indices.min(axis=0) - first < 1).all() and (last - indices.max(axis=0) < 1).all()

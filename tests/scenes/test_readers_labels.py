@@ -86,10 +86,10 @@ def on(grid, label_map, value):
     index = grid.index(label_map.grid.place(marked))
     at = np.rint(index).astype(int)
     np.testing.assert_allclose(index, at, atol=2e-3)
-    found = np.zeros(grid.size[::-1], bool)
-    found[tuple(at.T[::-1])] = True
-    assert found.sum() == len(marked)
-    return found
+    labelled = np.zeros(grid.size[::-1], bool)
+    labelled[tuple(at.T[::-1])] = True
+    assert labelled.sum() == len(marked)
+    return labelled
 
 
 def by_name(maps, grid=None):
@@ -204,10 +204,10 @@ class TestLabelMaps:
         path, grid, layers = slicer()
         maps = open_labels(path).maps(None)
         assert len(maps) == 2 and all(one.grid.same_as(grid) for one in maps)
-        found = by_name(maps)
-        assert np.array_equal(found["Kidney L"], layers[..., 0] == 1)
-        assert np.array_equal(found["aorta"], layers[..., 0] == 2)
-        assert np.array_equal(found["renal mass"], layers[..., 1] == 1)
+        labelled = by_name(maps)
+        assert np.array_equal(labelled["Kidney L"], layers[..., 0] == 1)
+        assert np.array_equal(labelled["aorta"], layers[..., 0] == 2)
+        assert np.array_equal(labelled["renal mass"], layers[..., 1] == 1)
         assert [
             s.name for s in open_labels(slicer("Segment3_Name:=GTV\nSegment3_LabelValue:=7")[0]).empty
         ] == ["GTV"]
@@ -233,10 +233,10 @@ class TestLabelMaps:
         sitk.WriteImage(empty, str(tmp_path / "kidney_cyst_left.nii.gz"))
         sitk.WriteImage(empty, str(tmp_path / "kidney_right.nii.gz"))
         (tmp_path / "brain.nii.gz").write_bytes(b"never read")
-        found = by_name(open_labels(tmp_path).maps(None), VoxelGrid.of(empty))
-        assert set(found) == {"kidney_left", "liver"}
+        labelled = by_name(open_labels(tmp_path).maps(None), VoxelGrid.of(empty))
+        assert set(labelled) == {"kidney_left", "liver"}
         assert {s.name for s in open_labels(tmp_path).empty} == {"kidney_right", "kidney_cyst_left"}
-        assert np.array_equal(found["kidney_left"], sitk.GetArrayFromImage(drawn(empty, (1, KIDNEY))) == 1)
+        assert np.array_equal(labelled["kidney_left"], sitk.GetArrayFromImage(drawn(empty, (1, KIDNEY))) == 1)
         refusal(tmp_path, read=lambda path: open_labels(path, wanted=["Brain"]), name="brain.nii.gz")
 
     def test_nothing_marked(self, tmp_path):
@@ -271,8 +271,8 @@ class TestSegmentations:
         masks = {"Kidney left": kidney, "renal mass": tumour}
         drawing = open_labels(write_segmentation(tmp_path / "seg.dcm", series, masks, kind))
         maps = drawing.maps(None)
-        found = by_name(maps, ct_grid(series))
-        assert all(np.array_equal(found[name], mask) for name, mask in masks.items())
+        labelled = by_name(maps, ct_grid(series))
+        assert all(np.array_equal(labelled[name], mask) for name, mask in masks.items())
         segments = [s for one in maps for s in one.segments.values()]
         assert [(s.value, s.tissue, s.side) for s in segments] == [(1, "kidney", "left"), (2, "tumour", None)]
         assert drawing.references.series == {series.uid}
@@ -294,16 +294,16 @@ class TestSegmentations:
         )
         data.PixelData, data.MaximumFractionalValue = data.PixelData.replace(b"\x80", b"\x7f"), 254
         data.save_as(path)
-        found = by_name(open_labels(path).maps(None), ct_grid(series))["Kidney"]
-        assert np.array_equal(found, shares == 0.5)
+        labelled = by_name(open_labels(path).maps(None), ct_grid(series))["Kidney"]
+        assert np.array_equal(labelled, shares == 0.5)
 
     def test_beside_its_series(self, series, tmp_path):
         write_segmentation(tmp_path / "ct" / "seg.dcm", series, {"Kidney": solid(series, KIDNEY)})
         assert "Kidney" in by_name(open_labels(tmp_path / "ct").maps(None))
         assert np.array_equal(open_ct(tmp_path / "ct").read().sum(), series.hounsfield.sum())
         archive = zipped(tmp_path / "ct", tmp_path / "a.zip")
-        found = by_name(open_labels(archive).maps(None), ct_grid(series))
-        assert np.array_equal(found["Kidney"], solid(series, KIDNEY))
+        labelled = by_name(open_labels(archive).maps(None), ct_grid(series))
+        assert np.array_equal(labelled["Kidney"], solid(series, KIDNEY))
         shutil.copy(tmp_path / "ct" / "seg.dcm", tmp_path / "ct" / "seg2.dcm")
         assert "2 segmentations" in refusal(tmp_path / "ct", read=open_labels, name="seg2.dcm")
 
@@ -353,12 +353,12 @@ class TestContours:
         assert mass.segments[1].tissue == "tumour" and mass.values.any(axis=(1, 2)).sum() == 1
         assert kidney.grid.spacing[2] == pytest.approx(step * series.gap, abs=1e-3)
         cut = self.OUTER * (1 - np.cos(np.pi / 360)) + 2e-4
-        found = on(grid, kidney, 1)
+        labelled = on(grid, kidney, 1)
         radius = np.full(grid.size[::-1], np.inf)
         for k, middle in zip(planes, middles, strict=True):
             radius[k] = np.linalg.norm(series.places(k) - middle, axis=-1)
-        assert found[(radius > self.INNER + cut) & (radius < self.OUTER - cut)].all()
-        assert not found[(radius < self.INNER - cut) | (radius > self.OUTER + cut)].any()
+        assert labelled[(radius > self.INNER + cut) & (radius < self.OUTER - cut)].all()
+        assert not labelled[(radius < self.INNER - cut) | (radius > self.OUTER + cut)].any()
 
     def test_across_slices(self, series, tmp_path):
         turned = Rotation.from_rotvec(0.9 * series.direction[:, 0]).as_matrix() @ series.direction
@@ -422,9 +422,9 @@ class TestTogether:
         unnumbered = [
             replace(one, segments={1: Segment.named(s.name)}) for one in maps for s in one.segments.values()
         ]
-        for given, word in ((maps, "cyst"), (unnumbered, "2")):
+        for label_maps, word in ((maps, "cyst"), (unnumbered, "2")):
             with pytest.raises(PatientError, match=f"the cyst's label {word} is not in the label map"):
-                assign_tissues(given, [], {"cyst": [word]})
+                assign_tissues(label_maps, [], {"cyst": [word]})
         assert assign_tissues(maps, [], {"cyst": ["cyst"]}, [Segment.named("Cyst")]) == maps
         with pytest.raises(PatientError, match="the organ's label kidney_right is not in the label map"):
             assign_tissues(maps, ["kidney_right"], {}, [Segment.named("kidney_right")])

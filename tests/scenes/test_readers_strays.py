@@ -255,7 +255,8 @@ def test_a_segmentation_of_slices_with_a_series_each_is_theirs(tmp_path):
     series = Series(tmp_path / "ct", DIRECTIONS["identity"])
     split(series)
     write_segmentation(tmp_path / "seg.dcm", series, {"Left kidney": series.hounsfield > 300})
-    found = open_labels(tmp_path / "seg.dcm")
+    labels = open_labels(tmp_path / "seg.dcm")
     assert (
-        read_ct(tmp_path / "ct", labels=found.references)[0].references.instances & found.references.instances
+        read_ct(tmp_path / "ct", labels=labels.references)[0].references.instances
+        & labels.references.instances
     )

@@ -311,8 +311,8 @@ class TestOnPixels:
         contours = [one, other]
         if turned:
             contours = [c[:, [1, 0, 2]] for c in contours]
-        found, notes = single(tmp_path, grid_of(3.0), contours)
-        assert found.values.sum() == 24 * 21 and found.values.all(axis=(1, 2)).any() and notes == []
+        filled, notes = single(tmp_path, grid_of(3.0), contours)
+        assert filled.values.sum() == 24 * 21 and filled.values.all(axis=(1, 2)).any() and notes == []
 
     @pytest.mark.parametrize(("start", "end"), [((20, 25), (10, 25)), ((20, 22), (10, 13))])
     def test_keyhole(self, tmp_path, start, end):
@@ -321,16 +321,16 @@ class TestOnPixels:
         hole = [[x, y], [20, 20], [30, 20], [30, 30], [20, 30], [x, y]]
         outer = [list(end), [10, 10], [40, 10], [40, 40], [10, 40], list(end)]
         corners = np.array([[*p, 6.0] for p in outer + hole[:1] + hole[1:]], float)
-        found, _ = single(tmp_path, grid_of(3.0), [corners])
+        filled, _ = single(tmp_path, grid_of(3.0), [corners])
         expected = np.ones((31, 31), int)
         expected[11:20, 11:20] = 0  # between the hole's edges, which are of the region
-        assert np.array_equal(found.values[0], expected)
+        assert np.array_equal(filled.values[0], expected)
 
     @pytest.mark.parametrize("kind", ["CLOSED_PLANAR", "CLOSEDPLANAR_XOR"])
     def test_body_in_a_hole(self, tmp_path, kind):
         contours = [box(6.0, (n + 0.5, n + 0.5), (60.5 - n, 60.5 - n)) for n in (0, 10, 20)]
-        found, _ = single(tmp_path, grid_of(3.0), contours, kind=kind)
-        assert found.values.sum() == 60**2 - 40**2 + 20**2
+        filled, _ = single(tmp_path, grid_of(3.0), contours, kind=kind)
+        assert filled.values.sum() == 60**2 - 40**2 + 20**2
 
 
 class TestTypes:
@@ -429,8 +429,8 @@ class TestGaps:
             "region 1: a gap too wide to interpolate was left empty, between z 40.0 and z 60.0 mm"
         ]
         assert ndimage.label(one.values)[1] == 2
-        asked = open_labels(tmp_path / "rt.dcm", wanted=["spleen"])
-        assert "too wide" not in str(notes[1:]) and asked.empty == ()
+        named = open_labels(tmp_path / "rt.dcm", wanted=["spleen"])
+        assert "too wide" not in str(notes[1:]) and named.empty == ()
         refusal(
             tmp_path / "rt.dcm",
             read=lambda path: open_labels(path, wanted=["spleen"]).maps(grid),

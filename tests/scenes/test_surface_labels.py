@@ -29,10 +29,10 @@ def test_a_support_states_its_coordinate_system(tmp_path):
 
 def test_an_import_of_surfaces(tmp_path, monkeypatch):
     """From files to the organ that is taken; its surface is made elsewhere."""
-    given = {}
+    taken = {}
 
     def watched(volume, labels, organ, side, **_):
-        given.update(labels=labels)
+        taken.update(labels=labels)
         raise KeyboardInterrupt
 
     monkeypatch.setattr("scenes.patients.import_request.import_patient", watched)
@@ -44,5 +44,5 @@ def test_an_import_of_surfaces(tmp_path, monkeypatch):
     ]
     with pytest.raises(KeyboardInterrupt):
         import_request(tmp_path / "ct.nrrd", files, ["a"], {"tumour": ["b"]})
-    tissues = [s.tissue for s in given["labels"].segments.values()]
+    tissues = [s.tissue for s in taken["labels"].segments.values()]
     assert sorted(tissues) == ["kidney", "tumour"]
