@@ -206,3 +206,13 @@ class TestUnderTheOrgan:
         inner = shares < 0.8
         assert len(gaps) > 150 and not covered.any()
         assert np.abs(np.sort(gaps) - expected)[inner].max() < 22 * 12 / len(gaps)
+
+    def test_it_states_its_coordinate_system(self, tmp_path, organ):
+        """In RAS, by the header of 3D Slicer."""
+        bed = slab((80, 10, 120), (0, LEFT[1][1] + 6, 0))
+        in_ras = trimesh.Trimesh(bed.vertices * [-1, -1, 1], bed.faces)
+        (tmp_path / "bed.stl").write_bytes(
+            b"SPACE=RAS".ljust(80, b"\0") + in_ras.export(file_type="stl")[80:]
+        )
+        read = bed_of_file(tmp_path / "bed.stl", organ, SUPINE)
+        np.testing.assert_allclose(read.center_mass, bed.center_mass, atol=1e-3)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from dicom_series import Series, write_structures
+from raw_nrrd import with_segments
 from synthetic_body import (
     BODY,
     DIRECTIONS,
@@ -78,11 +79,10 @@ def valued(image, *masks):
 
 def slicer(path: Path, image, named):
     """A .seg.nrrd of 3D Slicer: segments (name, mask), of which later ones cover earlier ones."""
-    labels = valued(image, *(mask for _, mask in named))
-    for n, (name, _) in enumerate(named):
-        for key, value in dict(Name=name, LabelValue=str(n + 1), Layer="0", ID=f"Segment_{n}").items():
-            labels.SetMetaData(f"Segment{n}_{key}", value)
-    return written(path, labels)
+    segments = [
+        dict(Name=name, LabelValue=n, Layer=0, ID=f"Segment_{n}") for n, (name, _) in enumerate(named, 1)
+    ]
+    return written(path, with_segments(valued(image, *(mask for _, mask in named)), segments))
 
 
 def stack(solid, heights=HEIGHTS):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from dicom_series import PERSON, Series, write_segmentation, write_structures
-from synthetic_body import BODY, DIRECTIONS, LEFT, RIGHT, TUMOUR, coarsely, level
+from synthetic_body import BODY, DIRECTIONS, LEFT, RIGHT, TUMOUR, coarsely, level, section
 
 from app import main
 from errors import PatientError
@@ -16,7 +16,6 @@ from scenes.import_findings import read_findings
 from scenes.patients.import_command import position_mm
 from scenes.patients.import_request import import_request, volume_of_labels
 from scenes.patients.readers.label_files import open_labels
-from scenes.patients.readers.label_maps import LabelMap
 from scenes.scene import load_scene
 from scenes.terminal import shell_command
 
@@ -223,31 +222,15 @@ def test_a_value_that_no_voxel_has_is_noted(hospital, taken_in, tmp_path, monkey
     assert not any("tumour's label" in note for note in patient.notes)
 
 
-@pytest.mark.parametrize(
-    ("kept", "often", "note"),
-    [
-        ([0, 1, 2, 3, 4], 2, "region 1: contours that stand twice in a plane, counted once: 5"),
-        ([0, 1, 3, 4], 1, "region 1: slices without a contour, interpolated between their neighbours, at z "
-            "12.5 mm"),
-    ],
-)  # fmt: skip
-def test_what_was_mended_in_contours_is_noted(hospital, taken_in, tmp_path, monkeypatch, kept, often, note):
+def test_what_was_mended_in_contours_is_noted(hospital, taken_in, tmp_path, monkeypatch):
     monkeypatch.setattr("scenes.patients.import_request.import_patient", lambda *_, **__: taken_in)
-    turn = np.linspace(0, 2 * np.pi, 40, endpoint=False)
-    circle = LEFT[0] + 15 * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
-    contours = [circle + [0, 0, 3.5 * k - 6.5] for k in kept] * often
+    contours = [section((LEFT[0], np.full(3, 15.0)), LEFT[0] + [0, 0, 3.5 * k - 6.5]) for k in range(5)] * 2
     path = write_structures(tmp_path / "rt.dcm", {"Kidney left": contours}, hospital[1].uid)
     patient = import_request(hospital[0] / "ct", [path])
-    assert note in (*patient.notes, *patient.warnings)
-
-
-def test_a_seed_makes_a_draft(hospital, taken_in, monkeypatch):
-    labels = LabelMap.of(sitk.Image([4, 4, 4], sitk.sitkUInt8) + 1)
-    monkeypatch.setattr("scenes.patients.import_request.draft_segmentation", lambda ct, seed: labels)
-    monkeypatch.setattr(
-        "scenes.patients.import_request.import_patient", lambda ct, labels, *_, **__: taken_in
+    assert "region 1: contours that stand twice in a plane, counted once: 5" in (
+        *patient.notes,
+        *patient.warnings,
     )
-    assert import_request(hospital[0] / "ct", seed_mm=LEFT[0]).draft and not taken_in.draft
 
 
 class TestProbeAndStiffness:

@@ -9,6 +9,7 @@ import pytest
 import SimpleITK as sitk
 from dicom_series import PERSON, Series, write_structures
 from pydicom.dataset import Dataset
+from raw_nrrd import with_segments
 from synthetic_body import DIRECTIONS, LEFT, TUMOUR, body, coarsely, level, section
 
 from app import main
@@ -93,10 +94,10 @@ def from_slicer(folder: Path) -> list[Path]:
     folder.mkdir()
     for image in (ct, labels):
         image.SetMetaData("descrip", "Long^Small, X-22-ID, St Elsewhere, calls himself Jim, 19600229")
-    for number, name in enumerate(("kidney of Long Small", "kidney_left", "GTV Wolpertinger"), start=1):
-        labels.SetMetaData(f"Segment{number}_Name", name)
-        labels.SetMetaData(f"Segment{number}_LabelValue", str(number))
-        labels.SetMetaData(f"Segment{number}_Layer", "0")
+    names = "kidney of Long Small", "kidney_left", "GTV Wolpertinger"
+    labels = with_segments(
+        labels, [dict(Name=name, LabelValue=n, Layer=0) for n, name in enumerate(names, 1)]
+    )
     sitk.WriteImage(ct, str(folder / "Ünal.nrrd"))
     sitk.WriteImage(
         sitk.Cast(labels, sitk.sitkUInt8), str(folder / "Long^Small.seg.nrrd"), useCompression=True

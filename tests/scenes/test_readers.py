@@ -23,6 +23,7 @@ from dicom_series import (
     zipped,
 )
 from pydicom.uid import DeflatedExplicitVRLittleEndian, generate_uid
+from raw_nrrd import with_segments
 from synthetic_body import DIRECTIONS, grid_around, with_voxels
 
 from errors import PatientError
@@ -353,11 +354,9 @@ def samples(folder, kind):
         ring = series.places(2)[2:6, 2:7].reshape(-1, 3)[[0, 4, 19, 15]]
         path = write_structures(folder / "rt.dcm", {"Kidney": [ring]}, series.uid)
         yield path, path, open_labels
-        slicer = sitk.Compose(noise(kind=np.uint8), noise(kind=np.uint8))
-        for n in range(2):
-            for key, value in {"Name": "Kidney", "Layer": str(n), "LabelValue": "1"}.items():
-                slicer.SetMetaData(f"Segment{n}_{key}", value)
-        path = written(folder / "k.seg.nrrd", slicer)
+        layers = sitk.Compose(noise(kind=np.uint8), noise(kind=np.uint8))
+        segments = [dict(Name="Kidney", Layer=n, LabelValue=1) for n in range(2)]
+        path = written(folder / "k.seg.nrrd", with_segments(layers, segments))
         yield path, path, open_labels
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import SimpleITK as sitk
+from raw_nrrd import with_segments
 from synthetic_body import LEFT, LEFT_ML, RIGHT, TUMOUR, body, coarsely, drawn, grid_around, level, points_of
 from test_label_files import strips
 
@@ -259,12 +260,8 @@ class TestUnknown:
             for one, image in zip(layers, images, strict=True):
                 sitk.WriteImage(image, str(folder / "labels" / f"{one}.nii.gz"))
             return folder / "ct.nii.gz", [folder / "labels"]
-        joined = sitk.Compose(*images)
-        for n, one in enumerate(layers):
-            joined.SetMetaData(f"Segment{n}_Name", one)
-            joined.SetMetaData(f"Segment{n}_LabelValue", "1")
-            joined.SetMetaData(f"Segment{n}_Layer", str(n))
-        sitk.WriteImage(joined, str(folder / "a.seg.nrrd"))
+        segments = [dict(Name=one, LabelValue=1, Layer=n) for n, one in enumerate(layers)]
+        sitk.WriteImage(with_segments(sitk.Compose(*images), segments), str(folder / "a.seg.nrrd"))
         return folder / "ct.nii.gz", [folder / "a.seg.nrrd"]
 
     @pytest.mark.parametrize("form", ["folder", "Slicer"])
