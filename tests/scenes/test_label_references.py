@@ -72,15 +72,17 @@ def names_its_study_alone(data):
     del data.ReferencedFrameOfReferenceSequence[0].RTReferencedStudySequence[0].RTReferencedSeriesSequence
 
 
+EVERYTHING = dict(frame_of_reference="1.2", series_uid="1.3", sops=["1.4", "1.5"])
+# Options of a structure set, and what it refers to: frame, series, slices.
 STRUCTURES = {
-    "all": (dict(frame_of_reference="1.2", series_uid="1.3", sops=["1.4", "1.5"]), "1.2", "1.3", ["1.4", "1.5"]),
+    "all": (EVERYTHING, "1.2", "1.3", ["1.4", "1.5"]),
     "series": (dict(series_uid="1.3"), "", "1.3", []),
     "slices": (dict(sops=["1.4"]), "", "", ["1.4"]),
     "frame": (dict(frame_of_reference="1.2"), "1.2", "", []),
     "nothing": ({}, "", "", []),
     "slices of contours": (dict(edit=contour_names("1.4")), "", "", ["1.4"]),
     "a study, which is no slice": (dict(series_uid="1.3", edit=names_its_study_alone), "", "", []),
-}  # fmt: skip
+}
 
 
 def structures(folder, series, **options):

@@ -379,6 +379,14 @@ class TestWarnings:
         lines = imported(with_voxels(ct, voxels), shifted, [2], margin_mm=20.0, tumour=[3]).warnings
         assert len(lines) == len(words) and all(word in line for word, line in zip(words, lines, strict=True))
 
+    def test_contrast_agent_in_the_kidney(self, ct_and_labels):
+        """How much of it, on a finer grid: test_dense_findings.py."""
+        ct, labels = ct_and_labels
+        voxels = sitk.GetArrayFromImage(ct)
+        voxels[level(points_of(ct), (LEFT[0] + [0, 0, 25], np.full(3, 6.0))) < 0] = 500
+        (warning,) = imported(with_voxels(ct, voxels), labels, [2], margin_mm=20.0, tumour=[3]).warnings
+        assert "(--stones)" in warning and "120 HU: enhanced" in warning
+
     def test_a_label_that_is_no_whole_kidney(self, ct_and_labels):
         """Hollow, and cut off above."""
         ct, labels = ct_and_labels

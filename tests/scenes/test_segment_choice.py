@@ -74,7 +74,8 @@ LESIONS = {
     "kidney": "riñón rein Niere rene rim_direito nier 腎 左肾",
     "urine": "uretère uréter Harnleiter Nierenbecken bassinet Left_kidney_pelvis 尿管",
     "sinus": "Nierensinus sinus_renal",
-    None: "Befund ROI_1 finding unknown Liver_lesion Leberzyste Splenic_cyst Bone_metastasis Adrenal_mass Опухоль",
+    None: "Befund ROI_1 finding unknown Опухоль "
+    "Liver_lesion Leberzyste Splenic_cyst Bone_metastasis Adrenal_mass",
 }
 
 
@@ -168,10 +169,10 @@ class TestDerived:
 class TestDrawnTwice:
     @pytest.mark.parametrize("names", [("Kidney_L", "Kidney_L"), ("Kidney_L_AB", "Kidney_L_CD")], ids=str)
     def test_two_of_equal_rank_are_united_with_a_note(self, names):
-        maps = [segment(names[0], LEFT), segment(names[1], (LEFT[0] + [0, 0, 6.0], LEFT[1]))]
-        ml, notes = organ_ml(maps)
+        first, second = names
+        ml, notes = organ_ml([segment(first, LEFT), segment(second, (LEFT[0] + [0, 0, 6.0], LEFT[1]))])
         assert ml > 1.04 * LEFT_ML
-        assert notes == (f"united, as they are one structure drawn twice: “{names[0]}”, “{names[1]}”",)
+        assert notes == (f"united, as they are one structure drawn twice: “{first}”, “{second}”",)
 
     def test_each_name_is_said_once(self):
         _, notes = organ_ml([segment(name, LEFT) for name in ("Kidney_L", "Kidney_L_1", "Kidney_L old")])

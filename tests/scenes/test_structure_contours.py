@@ -87,12 +87,18 @@ COPIES = {
 
 
 # One outline as planning systems write it.
+SHUFFLED = np.random.default_rng(1).permutation(len(BALL))
 OUTLINES = {
     "each point twice": [np.repeat(np.vstack([c, c[:1]]), 2, axis=0) for c in BALL],
-    "any order and direction": [BALL[n][:: 1 - 2 * (n % 2)] for n in np.random.default_rng(1).permutation(len(BALL))],
-    "clicks of one to three points": [*BALL, *(c[:1] for c in BALL), *(c[:2] for c in BALL), BALL[5][[0, 3, 0]]],
+    "any order and direction": [BALL[n][:: 1 - 2 * (n % 2)] for n in SHUFFLED],
+    "clicks of one to three points": [
+        *BALL,
+        *(c[:1] for c in BALL),
+        *(c[:2] for c in BALL),
+        BALL[5][[0, 3, 0]],
+    ],
     "a misplaced point": [c[[*range(40), 41, 40, *range(42, 90)]] for c in BALL],
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("outline", OUTLINES)
