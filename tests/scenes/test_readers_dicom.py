@@ -110,7 +110,8 @@ class TestSeries:
         series.write()
         _, voxels = read_ct(tmp_path)
         exact = series.stored * slope + intercept
-        assert np.abs(voxels - exact).max() <= 0.5 + 1e-3
+        # Slopes that are no binary fractions are rounded themselves.
+        assert np.abs(voxels - exact).max() <= 0.5 + 1e-3 * (slope % 0.5 > 0)
 
     def test_part_of_a_series(self, tmp_path):
         series = Series(tmp_path)
@@ -303,7 +304,7 @@ class TestGeometry:
             ((2, 0.5), {}, ("slice 3 (s1-2.dcm)", "one position")),
             ((2, 0), dict(PixelData=bytes(240)), ("slice 3 (s1-2.dcm)", "one position")),
             ((6, 0), dict(PixelSpacing=[0.7, 0.82]), ("of different pixel spacing",)),
-            ((6, 0), dict(ImageOrientationPatient=[1, 0, 0, 0, 0, -1]), ()),
+            ((6, 0), dict(ImageOrientationPatient=[1, 0, 0, 0, 0, -1]), ("of different orientation",)),
         ],
         ids=["too close", "beside it", "other pixels", "pixel spacing", "orientation"],
     )
