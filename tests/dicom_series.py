@@ -62,7 +62,7 @@ def refusal(
 
 
 class Series:
-    """A tiny CT series: 6 slices of 12 x 10 voxels, 0.8 x 0.7 mm, 2.5 mm apart, any orientation.
+    """A tiny CT series: by default 6 slices of 12 x 10 voxels, 0.8 x 0.7 mm, 2.5 mm apart, any orientation.
 
     `field` gives HU of places (n, 3) in LPS [mm]; without one the voxels are noise.
     """
@@ -81,9 +81,10 @@ class Series:
         signed: bool = False,
         origin: Iterable[float] = (-31.5, 20.25, -400.0),
         frame_of_reference: str | None = None,
+        spacing: tuple[float, float] = (0.8, 0.7),
     ) -> None:
         self.folder, self.direction, self.number = folder, np.asarray(direction, float), number
-        self.size, self.spacing, self.gap = size, (0.8, 0.7), gap
+        self.size, self.spacing, self.gap = size, spacing, gap
         self.origin = np.array(list(origin), float)
         self.slope, self.intercept, self.signed = slope, intercept, signed
         self.uid, self.study = generate_uid(), generate_uid()
@@ -214,6 +215,13 @@ def save(data: FileDataset, file: Path, preamble: bool = True) -> Path:
         plain = Dataset(data)
         pydicom.dcmwrite(file, plain, implicit_vr=True, little_endian=True, enforce_file_format=False)
     return file
+
+
+def edited(file: Path, edit: Callable[[Dataset], object]) -> Path:
+    """The file, with its data set changed."""
+    data = pydicom.dcmread(file)
+    edit(data)
+    return save(data, file)
 
 
 def dicom_bytes(data: FileDataset) -> bytes:

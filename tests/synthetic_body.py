@@ -90,6 +90,30 @@ def body(direction=DIRECTIONS["identity"], spacing=(3.0, 2.5, 4.0), z=(-90.0, 90
     return ct, labels
 
 
+def section(solid, origin, direction=DIRECTIONS["identity"], count=48):
+    """The contour (n, 3) of an ellipsoid on a plane through a place, along two axes of a direction; None
+    where there is none.
+    """
+    centre, axes = solid
+    plane = direction[:, :2] / axes[:, None]
+    start = (np.asarray(origin) - centre) / axes
+    middle = -np.linalg.lstsq(plane, start, rcond=None)[0]
+    nearest = start + plane @ middle
+    if nearest @ nearest >= 0.999:
+        return None
+    metric = np.linalg.cholesky(np.linalg.inv(plane.T @ plane))
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    at = middle[:, None] + np.sqrt(1 - nearest @ nearest) * metric @ [np.cos(angles), np.sin(angles)]
+    return np.asarray(origin) + (direction[:, :2] @ at).T
+
+
+def ellipsoid(solid, subdivisions=3):
+    """The surface of a solid."""
+    centre, axes = solid
+    ball = trimesh.creation.icosphere(subdivisions)
+    return trimesh.Trimesh(ball.vertices * axes + centre, ball.faces, process=False)
+
+
 def with_voxels(image, voxels):
     changed = sitk.GetImageFromArray(voxels)
     changed.CopyInformation(image)

@@ -2,16 +2,15 @@
 in the voxels.
 """
 
-import gzip
-
 import numpy as np
 import pytest
 import SimpleITK as sitk
-import trimesh
 from dicom_series import Series, write_segmentation, write_structures
-from synthetic_body import DIRECTIONS, coarsely, level
+from raw_nrrd import segment_lines, write_nrrd
+from synthetic_body import DIRECTIONS, coarsely, ellipsoid, level, section
 
 from scenes.patients.import_request import import_request
+from scenes.volumes.voxel_grid import VoxelGrid
 
 # Three different half-axes [mm], off the origin: no axis may be mirrored or exchanged.
 KIDNEY = np.array([40.0, 22.0, -63.0]), np.array([18.0, 14.0, 27.0])
@@ -70,40 +69,18 @@ def segmentation(kind):
 
 def structures(folder, series, _):
     """Each slice's section of the ellipsoid, as its polygon."""
-    centre, axes = (KIDNEY[0] @ series.direction, KIDNEY[1] @ np.abs(series.direction))
-    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
-    circle = np.column_stack([np.cos(angle), np.sin(angle)])
-    contours = []
-    for k in range(series.size[2]):
-        at = series.positions(k) @ series.direction
-        share = 1 - ((at[2] - centre[2]) / axes[2]) ** 2
-        if share > 0:
-            flat = centre[:2] + np.sqrt(share) * axes[:2] * circle
-            contours.append(np.column_stack([flat, np.full(len(flat), at[2])]) @ series.direction.T)
+    sections = [section(KIDNEY, series.positions(k), series.direction, 200) for k in range(series.size[2])]
+    contours = [corners for corners in sections if corners is not None]
     return write_structures(folder / "rt.dcm", {"Niere links": contours}, series.uid)
 
 
 def slicer(folder, _, image):
     """A second layer, in RAS."""
     inside = sitk.GetArrayFromImage(image)
-    to_ras = np.diag([-1.0, -1.0, 1.0])
-    steps = to_ras @ np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()
-    lines = [
-        "NRRD0004", "type: uint8", "dimension: 4", "space: right-anterior-superior",
-        "sizes: 2 "
-        f"{' '.join(map(str, image.GetSize()))}", f"space directions: none {' '.join(map(vector, steps.T))}",
-        "kinds: list domain domain "
-        "domain", "encoding: gzip", f"space origin: {vector(to_ras @ image.GetOrigin())}",
-        *(f"Segment0_{key}:={value}" for key, value in LAYER.items()),
-    ]  # fmt: skip
-    voxels = np.stack([np.zeros_like(inside), inside], axis=-1)
-    path = folder / "labels.seg.nrrd"
-    path.write_bytes("\n".join([*lines, "", ""]).encode() + gzip.compress(voxels.tobytes()))
-    return path
-
-
-def vector(numbers):
-    return f"({','.join(f'{n:.9g}' for n in numbers)})"
+    layers = np.stack([np.zeros_like(inside), inside], axis=-1)
+    in_ras = dict(space="space: right-anterior-superior", signs=(-1, -1, 1))
+    path, fields = folder / "labels.seg.nrrd", segment_lines([LAYER])
+    return write_nrrd(path, VoxelGrid.of(image), layers, **in_ras, fields=fields)
 
 
 def file_per_organ(folder, _, image):
@@ -115,8 +92,8 @@ def file_per_organ(folder, _, image):
 
 def surface(ending, space, scale):
     def write(folder, *_):
-        body = trimesh.creation.icosphere(subdivisions=4)
-        body.vertices = (body.vertices * KIDNEY[1] + KIDNEY[0]) * scale
+        body = ellipsoid(KIDNEY, subdivisions=4)
+        body.vertices *= scale
         if np.prod(scale) < 0:
             body.invert()
         path = folder / f"left kidney{ending}"

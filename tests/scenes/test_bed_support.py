@@ -4,7 +4,18 @@ import igl
 import numpy as np
 import pytest
 import trimesh
-from synthetic_body import LEFT, TUMOUR, assert_sound, body, coarsely, drawn, grid_around, least_gap, level
+from synthetic_body import (
+    LEFT,
+    TUMOUR,
+    assert_sound,
+    body,
+    coarsely,
+    drawn,
+    ellipsoid,
+    grid_around,
+    least_gap,
+    level,
+)
 
 from errors import PatientError
 from scenes.patients.organ_support import bed_of_file, bed_of_labels, mould, vertical_gaps
@@ -22,11 +33,15 @@ SMALL = np.array([10.0, -20.0, 30.0]), np.array([13.0, 11.0, 18.0])
 
 def small_organs_bed(muscle: tuple[np.ndarray, np.ndarray]) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
     """An organ that is soon made, and the bed of a muscle."""
-    organ = trimesh.creation.icosphere(subdivisions=3)
-    organ.vertices = organ.vertices * SMALL[1] + SMALL[0]
+    organ = ellipsoid(SMALL)
     empty = grid_around(SMALL[0] - 50, SMALL[0] + 50, (2.5, 2.5, 2.5))
     labels = LabelMap.of(drawn(empty, (4, muscle), (2, SMALL)), NAMES)
     return organ, bed_of_labels(organ, labels, [2, 3], SUPINE)
+
+
+def slab(size, centre) -> trimesh.Trimesh:
+    """A box of a size [mm] at a centre relative to the organ's."""
+    return trimesh.creation.box(np.asarray(size, float)).apply_translation(LEFT[0] + centre)
 
 
 @pytest.fixture(scope="module")
@@ -79,22 +94,21 @@ class TestBedOfLabels:
 class TestBedOfFile:
     def test_is_taken_as_it_is(self, ct_and_labels, patient, tmp_path):
         ct, labels = ct_and_labels
-        slab = trimesh.creation.box([80.0, 10.0, 120.0])
-        slab.apply_translation([70.0, LEFT[0][1] + LEFT[1][1] + 6.0, 12.0])
-        slab.export(tmp_path / "slab.stl")
+        bed = slab((80, 10, 120), (0, LEFT[1][1] + 6.0, 0))
+        bed.export(tmp_path / "slab.stl")
         again = import_patient(
             ct, LabelMap.of(labels, NAMES), margin_mm=10.0, support=str(tmp_path / "slab.stl")
         )
-        np.testing.assert_allclose(again.support.bounds, slab.bounds, atol=1e-4)
+        np.testing.assert_allclose(again.support.bounds, bed.bounds, atol=1e-4)
         assert np.array_equal(again.organ.vertices, patient.organ.vertices)
 
     def test_what_is_no_support(self, patient, tmp_path):
-        inside, far, open_ = (trimesh.creation.box([40.0, 40.0, 40.0]) for _ in range(3))
-        inside.apply_translation(LEFT[0])
-        far.apply_translation([-300.0, 0, 0])
-        open_.apply_translation(LEFT[0] + [0, 60, 0])
+        cube = (40, 40, 40)
+        inside, far = slab(cube, (0, 0, 0)), slab(cube, np.array([-300.0, 0, 0]) - LEFT[0])
+        open_, inward = slab(cube, (0, 60, 0)), slab((40, 10, 40), (0, 26, 0))
         open_.update_faces(np.arange(len(open_.faces)) > 0)
-        for name, mesh in (("inside", inside), ("far", far), ("open", open_)):
+        inward.invert()
+        for name, mesh in (("inside", inside), ("far", far), ("open", open_), ("inward", inward)):
             mesh.export(tmp_path / f"{name}.stl")
         (tmp_path / "text.stl").write_text("no surface")
         # Where x and y of the ellipsoid are equal, 15.6 mm, its surface is 4.4 mm inside the cube's; the
@@ -103,6 +117,7 @@ class TestBedOfFile:
             ("inside", r"reaches [45]\.\d mm into the organ"),
             ("far", r"is 32[3-7] mm from the organ"),
             ("open", "not a closed surface"),
+            ("inward", "faces outward"),
             ("text", "has no triangles"),
             ("absent", "no such file"),
         ]:
@@ -113,19 +128,15 @@ class TestBedOfFile:
 
 @pytest.fixture
 def organ() -> trimesh.Trimesh:
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    return trimesh.Trimesh(ball.vertices * LEFT[1] + LEFT[0], ball.faces)
+    return ellipsoid(LEFT)
 
 
 class TestUnderTheOrgan:
     """A support of the user's is under the organ along gravity, and close, or the organ leaves it."""
 
     @staticmethod
-    def box(folder, size, centre):
-        """A box of a size at a centre relative to the organ's [mm]."""
-        mesh = trimesh.creation.box(size)
-        mesh.apply_translation(LEFT[0] + centre)
-        mesh.export(folder / "bed.stl")
+    def file(folder, *boxes):
+        trimesh.util.concatenate(boxes).export(folder / "bed.stl")
         return folder / "bed.stl"
 
     @pytest.mark.parametrize(("position", "axis"), [("supine", 1), ("left-decubitus", 0)])
@@ -134,10 +145,10 @@ class TestUnderTheOrgan:
         gravity = np.array(GRAVITY[position])
         size = np.full(3, 120.0)
         size[axis] = 10.0
-        slab = self.box(tmp_path, size, gravity * (LEFT[1][axis] + gap + 5))
-        bed_of_file(slab, organ, gravity)
+        path = self.file(tmp_path, slab(size, gravity * (LEFT[1][axis] + gap + 5)))
+        bed_of_file(path, organ, gravity)
         with pytest.raises(PatientError, match="is under 0% of the organ and above 100% of it"):
-            bed_of_file(slab, organ, -gravity)
+            bed_of_file(path, organ, -gravity)
 
     @pytest.mark.parametrize(
         ("size", "centre", "words"),
@@ -156,26 +167,24 @@ class TestUnderTheOrgan:
     )
     def test_elsewhere(self, tmp_path, organ, size, centre, words):
         with pytest.raises(PatientError, match=words) as caught:
-            bed_of_file(self.box(tmp_path, size, centre), organ, SUPINE)
+            bed_of_file(self.file(tmp_path, slab(size, centre)), organ, SUPINE)
         assert "(0, 1, 0) in LPS" in str(caught.value) and "\n" not in str(caught.value)
 
-    def test_a_pin_is_no_support(self, tmp_path, organ):
-        """Though it touches the organ, and a slab is under all of it."""
-        pin = trimesh.creation.box([4.0, 14.0, 4.0])
-        pin.apply_translation(LEFT[0] + [0, 20.2 + 7, 0])
-        slab = trimesh.creation.box([80.0, 10.0, 120.0])
-        slab.apply_translation(LEFT[0] + [0, 39, 0])
-        trimesh.util.concatenate([pin, slab]).export(tmp_path / "pin.stl")
-        with pytest.raises(PatientError, match=r"is 1[45]\.\d mm under the organ"):
-            bed_of_file(tmp_path / "pin.stl", organ, SUPINE)
-
-    def test_a_cover(self, tmp_path, organ):
-        both = [trimesh.creation.box([80.0, 10.0, 120.0]) for _ in range(2)]
-        both[0].apply_translation(LEFT[0] + [0, 26, 0])
-        both[1].apply_translation(LEFT[0] + [0, -45, 0])
-        trimesh.util.concatenate(both).export(tmp_path / "cover.stl")
-        with pytest.raises(PatientError, match="covers 100% of the organ from above.*expected at most 10%"):
-            bed_of_file(tmp_path / "cover.stl", organ, SUPINE)
+    @pytest.mark.parametrize(
+        ("boxes", "words"),
+        [
+            # A pin touches the organ, and a slab is under all of it.
+            ([((4, 14, 4), (0, 27.2, 0)), ((80, 10, 120), (0, 39, 0))], r"is 1[45]\.\d mm under the organ"),
+            (
+                [((80, 10, 120), (0, 26, 0)), ((80, 10, 120), (0, -45, 0))],
+                "covers 100% of the organ from above.*expected at most 10%",
+            ),
+        ],
+        ids=["pin", "cover"],
+    )
+    def test_two_bodies(self, tmp_path, organ, boxes, words):
+        with pytest.raises(PatientError, match=words):
+            bed_of_file(self.file(tmp_path, *(slab(*box) for box in boxes)), organ, SUPINE)
 
     def test_the_programs_own_supports(self, tmp_path, organ, monkeypatch):
         monkeypatch.setattr("scenes.patients.organ_support.GRID_MM", 2.0)
@@ -188,9 +197,8 @@ class TestUnderTheOrgan:
         """Under an ellipsoid, at a share s of its projected area, a plane d below is d + c (1 - sqrt(1 -
         s)) away.
         """
-        slab = trimesh.creation.box([120.0, 10.0, 120.0])
-        slab.apply_translation(LEFT[0] + [0, LEFT[1][1] + 2 + 5, 0])
-        gaps, covered = vertical_gaps(slab, organ, SUPINE)
+        bed = slab((120, 10, 120), (0, LEFT[1][1] + 2 + 5, 0))
+        gaps, covered = vertical_gaps(bed, organ, SUPINE)
         shares = (np.arange(len(gaps)) + 0.5) / len(gaps)
         expected = 2 + LEFT[1][1] * (1 - np.sqrt(1 - shares))
         # The number of rays within an ellipse is its area's to about a ray in each row of 12; there are 22 mm
@@ -199,13 +207,12 @@ class TestUnderTheOrgan:
         assert len(gaps) > 150 and not covered.any()
         assert np.abs(np.sort(gaps) - expected)[inner].max() < 22 * 12 / len(gaps)
 
-
-def test_a_surface_that_faces_inward(tmp_path):
-    ball = trimesh.creation.icosphere(radius=20.0)
-    ball.apply_translation(LEFT[0])
-    box = trimesh.creation.box([40.0, 10.0, 40.0])
-    box.apply_translation(LEFT[0] + [0, 26, 0])
-    box.invert()
-    box.export(tmp_path / "in.stl")
-    with pytest.raises(PatientError, match="faces outward"):
-        bed_of_file(tmp_path / "in.stl", ball, SUPINE)
+    def test_it_states_its_coordinate_system(self, tmp_path, organ):
+        """In RAS, by the header of 3D Slicer."""
+        bed = slab((80, 10, 120), (0, LEFT[1][1] + 6, 0))
+        in_ras = trimesh.Trimesh(bed.vertices * [-1, -1, 1], bed.faces)
+        (tmp_path / "bed.stl").write_bytes(
+            b"SPACE=RAS".ljust(80, b"\0") + in_ras.export(file_type="stl")[80:]
+        )
+        read = bed_of_file(tmp_path / "bed.stl", organ, SUPINE)
+        np.testing.assert_allclose(read.center_mass, bed.center_mass, atol=1e-3)

@@ -44,6 +44,32 @@ def patient():
         return import_patient(LazyVolume.of(ct), LabelMap.of(labels, NAMES), side="left", margin_mm=30.0)
 
 
+def drawn_check(patient, folder, rows=None) -> np.ndarray:
+    """The picture (rows, columns, 3) of a patient."""
+    draw_check(patient, summary_rows(patient) if rows is None else rows, folder)
+    return matplotlib.image.imread(folder / "check.png")[..., :3]
+
+
+@pytest.fixture(scope="module")
+def file(patient, tmp_path_factory):
+    """The picture's file, of the patient with a sinus."""
+    folder = tmp_path_factory.mktemp("picture")
+    parts = {**patient.parts, "sinus": ball(patient.organ.centroid, 8.0)}
+    drawn_check(replace(patient, parts=parts), folder, summary_rows(patient))
+    return folder / "check.png"
+
+
+@pytest.fixture(scope="module")
+def picture(file):
+    return matplotlib.image.imread(file)[..., :3]
+
+
+def shown(picture, name):
+    """Where (rows, columns) a structure's colour is."""
+    colour = np.array([int(COLOUR[name][n : n + 2], 16) for n in (1, 3, 5)]) / 255
+    return np.argwhere(np.abs(picture - colour).max(axis=2) < 0.1)
+
+
 @pytest.mark.parametrize("view", [*VIEWS, OVERVIEW], ids=lambda view: view.name)
 def test_letters_are_those_of_the_axes(view):
     right, down = np.array(view.right), np.array(view.down)
@@ -74,22 +100,20 @@ def test_a_slice_tells_where_it_lies_as_viewers_of_ct_do():
     assert [view.position(-at) for view in VIEWS] == ["S 118 mm", "A 13 mm", "L 31 mm"]
 
 
-def test_outlines_and_surfaces_are_in_the_picture(patient, tmp_path):
-    draw_check(patient, summary_rows(patient), tmp_path)
-    picture = matplotlib.image.imread(tmp_path / "check.png")[..., :3]
-    assert picture.shape[:2] == (960, 1300)
-    half = picture.shape[0] // 2
+def test_outlines_and_surfaces_are_in_the_picture_under_their_letters(picture):
+    """The tumour is in all cuts, to the left, in front and above the kidney's middle: the first cut is
+    axial, where left is the picture's right.
+    """
+    assert picture.shape[:2] == (960, 1300) and TUMOUR[0][0] > LEFT[0][0] + 20
+    assert set(PARTS) < set(COLOUR) and len(shown(picture, "sinus")) > 100
     for name in ("organ", "tumour"):
-        wanted = np.array([int(COLOUR[name][n : n + 2], 16) for n in (1, 3, 5)]) / 255
-        shown = np.abs(picture - wanted).max(axis=2) < 0.1
-        assert shown[:half].sum() > 300, name
-    # In the axial cut the tumour lies to the picture's right of the kidney: on the patient's left.
-    axial = picture[:half, : picture.shape[1] // 3]
-    middle = {}
-    for name in ("organ", "tumour"):
-        wanted = np.array([int(COLOUR[name][n : n + 2], 16) for n in (1, 3, 5)]) / 255
-        middle[name] = np.argwhere(np.abs(axial - wanted).max(axis=2) < 0.1).mean(axis=0)
-    assert middle["tumour"][1] > middle["organ"][1] + 20 and TUMOUR[0][0] > LEFT[0][0]
+        assert len(shown(picture[:480], name)) > 300, name
+    for n, (sense, least) in enumerate(((1, 20), (1, 3), (-1, 3))):
+        panel = panel_of(picture, n)[0]
+        organ, tumour = (shown(panel, name) for name in ("organ", "tumour"))
+        assert len(organ) > 60 and len(tumour) > 60, n
+        down, right = tumour.mean(axis=0) - organ.mean(axis=0)
+        assert sense * right > least and down < -3, n
 
 
 def test_files_own_colours_are_shown_brightly(patient):
@@ -116,8 +140,7 @@ def test_colours_that_look_alike_are_not_used(patient, colours):
 def test_every_section_has_a_scale_bar(patient, tmp_path):
     """Its white pixels are as long as 20 mm of the image beside it."""
     dark = replace(patient, ct=with_voxels(patient.ct, np.full(patient.ct.GetSize()[::-1], -1000, np.int16)))
-    draw_check(dark, summary_rows(patient), tmp_path)
-    picture = matplotlib.image.imread(tmp_path / "check.png")[..., :3]
+    picture = drawn_check(dark, tmp_path)
     low, high = VoxelGrid.of(patient.ct).bounds()
     for n, view in enumerate(VIEWS):
         panel = panel_of(picture, n)[0]
@@ -161,10 +184,9 @@ def test_surfaces_are_lit_from_above_and_from_the_viewers_side(view, brightest):
     )
 
 
-def test_the_file_says_nothing_of_its_maker(patient, tmp_path):
-    draw_check(patient, summary_rows(patient), tmp_path)
-    content = (tmp_path / "check.png").read_bytes()
-    assert not any(word in content for word in (b"tEXt", b"iTXt", b"eXIf", str(tmp_path).encode()))
+def test_the_file_says_nothing_of_its_maker(file):
+    content = file.read_bytes()
+    assert not any(word in content for word in (b"tEXt", b"iTXt", b"eXIf", str(file.parent).encode()))
 
 
 def panel_of(picture, n):
@@ -182,60 +204,31 @@ def test_ct_lies_under_its_letters(patient, tmp_path):
     places = points_of(patient.ct)
     block = ((places > (85, 5, 14)) & (places < (105, 32, 40))).all(axis=-1)
     bright = with_voxels(patient.ct, np.where(block, 1000, -1000).astype(np.int16))
-    draw_check(replace(patient, ct=bright), summary_rows(patient), tmp_path)
-    picture = matplotlib.image.imread(tmp_path / "check.png")[..., :3]
+    picture = drawn_check(replace(patient, ct=bright), tmp_path)
     for n, sense in enumerate((1, 1, -1)):
         panel, column, row = panel_of(picture, n)
         at = np.median(np.argwhere(panel.min(axis=2) > 0.97), axis=0)
         assert sense * (at[1] - column) > 15 and row - at[0] > 15, n
 
 
-def test_outlines_lie_under_their_letters(patient, tmp_path):
-    """The tumour is in all cuts, to the left, in front and above the kidney's middle."""
-    draw_check(patient, summary_rows(patient), tmp_path)
-    picture = matplotlib.image.imread(tmp_path / "check.png")[..., :3]
-    for n, sense in enumerate((1, 1, -1)):
-        panel, middle = panel_of(picture, n)[0], {}
-        for name in ("organ", "tumour"):
-            wanted = np.array([int(COLOUR[name][k : k + 2], 16) for k in (1, 3, 5)]) / 255
-            shown = np.argwhere(np.abs(panel - wanted).max(axis=2) < 0.1)
-            assert len(shown) > 60, (n, name)
-            middle[name] = shown.mean(axis=0)
-        down, right = middle["tumour"] - middle["organ"]
-        assert sense * right > 3 and down < -3, n
-
-
-def test_the_whole_width_is_shown_where_it_is_wider_than_the_cuts(patient, tmp_path):
+def test_the_whole_width_is_shown_where_it_is_wider_than_the_cuts(patient, picture, tmp_path):
     """Else the surface is shown once more: below the middle it is shaded, and has no grey in it."""
     assert is_wider(patient.overview, patient.ct) and not is_wider(patient.ct, patient.ct)
-    grey = []
-    for each in (patient, replace(patient, overview=patient.ct)):
-        draw_check(each, summary_rows(each), tmp_path)
-        panel = matplotlib.image.imread(tmp_path / "check.png")[560:, 460:840, :3]
-        grey.append(((np.ptp(panel, axis=2) < 0.01) & (panel[..., 0] > 0.3)).sum())
-    assert grey[0] > 20 * grey[1]
+    panels = [
+        image[560:, 460:840]
+        for image in (picture, drawn_check(replace(patient, overview=patient.ct), tmp_path))
+    ]
+    wide, narrow = (((np.ptp(panel, axis=2) < 0.01) & (panel[..., 0] > 0.3)).sum() for panel in panels)
+    assert wide > 20 * narrow
 
 
-def test_every_part_is_drawn_in_its_colour(patient, tmp_path):
-    assert set(PARTS) < set(COLOUR)
-    sinus = ball(patient.organ.centroid, 8.0)
-    draw_check(replace(patient, parts={**patient.parts, "sinus": sinus}), summary_rows(patient), tmp_path)
-    picture = matplotlib.image.imread(tmp_path / "check.png")[..., :3]
-    wanted = np.array([int(COLOUR["sinus"][n : n + 2], 16) for n in (1, 3, 5)]) / 255
-    assert (np.abs(picture - wanted).max(axis=2) < 0.1).sum() > 100
-
-
-def test_long_text_ends_above_the_names_of_the_colours(patient, tmp_path):
+def test_long_text_ends_above_the_names_of_the_colours(patient, picture, tmp_path):
     """The text is white, the names are not."""
     rows = [("WARNING", "a warning of several lines, with what to do " * 5)] * 4 + summary_rows(patient)
-    white = []
-    for lines in (rows, summary_rows(patient)):
-        draw_check(patient, lines, tmp_path)
-        panel = matplotlib.image.imread(tmp_path / "check.png")[500:, 860:, :3]
-        white.append(np.flatnonzero((panel.min(axis=2) > 0.75).any(axis=1)))
+    panels = [image[500:, 860:] for image in (drawn_check(patient, tmp_path, rows), picture)]
+    long, short = (np.flatnonzero((panel.min(axis=2) > 0.75).any(axis=1)) for panel in panels)
     # The first name is 370 pixels below the middle of the picture.
-    assert white[0].max() < 368 and white[1].max() < 368
-    assert len(white[0]) > len(white[1])
+    assert long.max() < 368 and short.max() < 368 and len(long) > len(short)
 
 
 def test_the_summary_has_the_measures_of_the_labels(patient):

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
-from synthetic_body import LEFT, grid_around, level, points_of
+from synthetic_body import LEFT, ellipsoid, grid_around, level, points_of
 
 from scenes.patients.dense_findings import dense_findings
 from scenes.tissue_classes.collecting_system import DENSE_ABOVE_HU, LARGEST_STONE_ML
@@ -28,8 +28,7 @@ THIN, THICK = (1.5, 1.5, 1.5), (1.0, 1.2, 5.0)
 
 
 def organ() -> trimesh.Trimesh:
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    return trimesh.Trimesh(ball.vertices * KIDNEY[1] + KIDNEY[0], ball.faces)
+    return ellipsoid(KIDNEY)
 
 
 def made(spacing, kidney_hu, bright, labelled=None):
@@ -61,10 +60,12 @@ def bare_of(spacing, labelled) -> TissueMap:
 
 def shown(spacing, kidney_hu, bright, labelled) -> dict[str, float]:
     """Volumes [ml] of what the tissue map shows, but for what is labelled so."""
-    found = mapped(*made(spacing, kidney_hu, bright, labelled))
+    classes = mapped(*made(spacing, kidney_hu, bright, labelled))
     bare = bare_of(spacing, None if labelled is None else tuple(map(tuple, labelled)))
-    ml = float(np.prod(np.linalg.norm(np.linalg.inv(found.index_from_mm[:3, :3]), axis=0)) / 1000)
-    return {each: ml * float((found.mask(each) & ~bare.mask(each)).sum()) for each in ("urine", "stone")}
+    ml = float(np.prod(np.linalg.norm(np.linalg.inv(classes.index_from_mm[:3, :3]), axis=0)) / 1000)
+    return {
+        tissue: ml * float((classes.mask(tissue) & ~bare.mask(tissue)).sum()) for tissue in ("urine", "stone")
+    }
 
 
 @pytest.mark.parametrize("spacing", [THIN, THICK], ids=["thin", "thick"])

@@ -24,12 +24,9 @@ PLACEHOLDERS = {"CT": "ct", "LABELS": "segmentations"}
 def documented_imports() -> list[str]:
     """Arguments of app.py, each once."""
     pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-    found = [
-        line
-        for page in pages
-        for line in re.findall(r"python app\.py (import [^`\n]*)", page.read_text("utf-8"))
-    ]
-    return list(dict.fromkeys(re.split(r"\s+#", line)[0].strip() for line in found))
+    commands = re.compile(r"python app\.py (import [^`\n]*)")
+    lines = [line for page in pages for line in commands.findall(page.read_text("utf-8"))]
+    return list(dict.fromkeys(re.split(r"\s+#", line)[0].strip() for line in lines))
 
 
 def virtual_tumour() -> str:
@@ -95,5 +92,7 @@ def test_a_command_line_of_the_documents(clinic, tmp_path, line):
         words[words.index("--out") + 1] = str(tmp_path / "patient")
     assert main(words) == 0
     if "--out" in words:
-        found = read_findings(tmp_path / "patient")
-        assert found.side == "left" and ("tumour" in found.surfaces) == ("--seed" not in words)
+        findings = read_findings(tmp_path / "patient")
+        is_draft = "--seed" in words
+        assert (findings.side, findings.draft) == ("left", is_draft)
+        assert ("tumour" in findings.surfaces) == (not is_draft)

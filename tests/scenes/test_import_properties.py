@@ -9,7 +9,7 @@ import SimpleITK as sitk
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from synthetic_body import BODY, LEFT, RIGHT, drawn, grid_around, voxels_to_boundary
+from synthetic_body import BODY, LEFT, RIGHT, coarsely, drawn, grid_around, voxels_to_boundary
 
 import scenes.patients.patient_import
 from scenes.patients.patient_import import import_patient
@@ -44,6 +44,7 @@ def grids(draw, low, high, along=SPACING):
 @pytest.fixture(autouse=True)
 def _without_the_support(monkeypatch):
     """Which is tested by itself, and takes most of the time."""
+    coarsely(monkeypatch)
     monkeypatch.setattr(scenes.patients.patient_import, "_support", lambda kind, organ, *_: organ)
 
 

@@ -5,7 +5,7 @@ need.
 import numpy as np
 import pydicom
 import pytest
-from dicom_series import Series, refusal, save, write_segmentation
+from dicom_series import Series, edited, refusal, save, write_segmentation
 from test_readers_labels import by_name, ct_grid
 
 from scenes.patients.readers.label_files import open_labels
@@ -70,15 +70,15 @@ def test_without_what_is_not_needed(series, masks, tmp_path, kind):
         for name in names:
             without([data], name.split("."))
         save(data, tmp_path / "less.dcm")
-        found = by_name(open_labels(tmp_path / "less.dcm").maps(None), ct_grid(series))
-        assert all(np.array_equal(found[name], mask > 0) for name, mask in masks.items()), names
+        labelled = by_name(open_labels(tmp_path / "less.dcm").maps(None), ct_grid(series))
+        assert all(np.array_equal(labelled[name], mask > 0) for name, mask in masks.items()), names
 
 
 @pytest.mark.parametrize("name", ["Rows", "SegmentationType", "SegmentSequence.SegmentNumber"])
 def test_without_what_is_needed(series, masks, tmp_path, name):
-    data = pydicom.dcmread(write_segmentation(tmp_path / "seg.dcm", series, masks))
-    without([data], name.split("."))
-    refusal(save(data, tmp_path / "less.dcm"), read=lambda path: open_labels(path).maps(None))
+    path = write_segmentation(tmp_path / "seg.dcm", series, masks)
+    edited(path, lambda data: without([data], name.split(".")))
+    refusal(path, read=lambda path: open_labels(path).maps(None))
 
 
 @pytest.mark.parametrize("kind", ["BINARY", "FRACTIONAL"])
@@ -86,45 +86,42 @@ def test_without_what_is_needed(series, masks, tmp_path, name):
 def test_any_numbers(series, masks, tmp_path, kind, by):
     """Segment 0 is a segment as the others are, under its own number."""
     path = write_segmentation(tmp_path / "seg.dcm", series, masks, kind)
-    data = pydicom.dcmread(path)
-    renumber(data, by)
-    save(data, path)
-    found = by_name(open_labels(path).maps(None), ct_grid(series))
-    assert all(np.array_equal(found[name], mask > 0) for name, mask in masks.items())
+    edited(path, lambda data: renumber(data, by))
+    labelled = by_name(open_labels(path).maps(None), ct_grid(series))
+    assert all(np.array_equal(labelled[name], mask > 0) for name, mask in masks.items())
     assert values_of(path) == {"Kidney": 1 + by, "renal mass": 2 + by}
 
 
 @pytest.mark.parametrize("kind", ["BINARY", "FRACTIONAL"])
 def test_one_segment_that_no_frame_names(series, masks, tmp_path, kind):
     path = write_segmentation(tmp_path / "seg.dcm", series, {"Kidney": masks["Kidney"]}, kind)
-    data = pydicom.dcmread(path)
     for sequence in ("SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence"):
-        without([data], [sequence, "SegmentIdentificationSequence"])
-    save(data, path)
-    found = by_name(open_labels(path).maps(None), ct_grid(series))
-    assert np.array_equal(found["Kidney"], masks["Kidney"] > 0)
+        edited(path, lambda data, at=sequence: without([data], [at, "SegmentIdentificationSequence"]))
+    labelled = by_name(open_labels(path).maps(None), ct_grid(series))
+    assert np.array_equal(labelled["Kidney"], masks["Kidney"] > 0)
 
 
-class TestLabelMaps:
-    @pytest.mark.parametrize("label", ["Background", "Hintergrund", ""])
-    @pytest.mark.parametrize("padding", [True, False])
-    def test_their_background(self, series, masks, tmp_path, label, padding):
-        path = write_segmentation(tmp_path / "seg.dcm", series, masks, "LABELMAP")
-        data = pydicom.dcmread(path)
+def with_background(path, label, padding):
+    """A label map whose segment 0 has a label, without a value of padding but where it is wanted."""
+
+    def edit(data):
         (background,) = [one for one in data.SegmentSequence if one.SegmentNumber == 0]
         background.SegmentLabel = label
         if not padding:
             without([data], ["PixelPaddingValue"])
-        save(data, path)
-        assert values_of(path) == {"Kidney": 1, "renal mass": 2}
 
-    @pytest.mark.parametrize("label", ["Kidney", "renal mass"])
-    def test_a_structure_as_background(self, series, masks, tmp_path, label):
-        path = write_segmentation(tmp_path / "seg.dcm", series, masks, "LABELMAP")
-        data = pydicom.dcmread(path)
-        (background,) = [one for one in data.SegmentSequence if one.SegmentNumber == 0]
-        background.SegmentLabel = label
-        without([data], ["PixelPaddingValue"])
-        save(data, path)
-        message = refusal(path, read=open_labels)
-        assert f"segment 0 “{label}” is 0, which is the background" in message and "from 1" in message
+    return edited(path, edit)
+
+
+@pytest.mark.parametrize("label", ["Background", "Hintergrund", ""])
+@pytest.mark.parametrize("padding", [True, False])
+def test_the_background_of_label_maps(series, masks, tmp_path, label, padding):
+    path = write_segmentation(tmp_path / "seg.dcm", series, masks, "LABELMAP")
+    assert values_of(with_background(path, label, padding)) == {"Kidney": 1, "renal mass": 2}
+
+
+@pytest.mark.parametrize("label", ["Kidney", "renal mass"])
+def test_a_structure_as_background(series, masks, tmp_path, label):
+    path = write_segmentation(tmp_path / "seg.dcm", series, masks, "LABELMAP")
+    message = refusal(with_background(path, label, padding=False), read=open_labels)
+    assert f"segment 0 “{label}” is 0, which is the background" in message and "from 1" in message

@@ -3,15 +3,13 @@
 import numpy as np
 import pytest
 import SimpleITK as sitk
-from dicom_series import Series, refusal, write_segmentation, write_structures
 from synthetic_body import DIRECTIONS, drawn, grid_around
-from test_readers_labels import KIDNEY, by_name, ct_grid, ring
+from test_readers_labels import KIDNEY
 
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import LabelMap
 from scenes.patients.readers.label_merge import merge_label_maps
 from scenes.patients.readers.segment_choice import assign_tissues
-from scenes.patients.readers.segment_names import side_of
 from scenes.volumes.voxel_grid import VoxelGrid
 
 GRID = VoxelGrid.of(grid_around((-33, 18, -401), (-22, 30, -385), (0.7, 0.9, 1.6)))
@@ -67,21 +65,10 @@ class TestTogether:
 
 
 class TestLabelMaps:
-    @pytest.mark.parametrize("ending", [".nii.gz", ".nrrd"])
-    def test_shares_of_an_organ(self, tmp_path, ending):
-        voxels = np.random.default_rng(2).random((6, 6, 6)).astype(np.float32)
-        sitk.WriteImage(sitk.GetImageFromArray(voxels), str(tmp_path / f"kidney_left{ending}"))
-        assert "probability" in refusal(tmp_path, read=open_labels, name=f"kidney_left{ending}")
-
-    def test_a_file_is_called_as_its_one_value(self, tmp_path):
-        empty = grid_around((-33, 18, -401), (-22, 30, -385), (0.7, 0.9, 1.6))
-        sitk.WriteImage(drawn(empty, (4, KIDNEY)), str(tmp_path / "kidney_right.nii.gz"))
-        (one,) = open_labels(tmp_path / "kidney_right.nii.gz").maps(None)
-        assert [(s.tissue, s.side) for s in one.segments.values()] == [("kidney", "right")]
-
     @pytest.mark.parametrize(
         ("stem", "tissue", "side"),
         [
+            ("kidney_right", "kidney", "right"),
             ("label_left", "kidney", "left"),
             ("r", "kidney", "right"),
             ("spleen_left", None, "left"),
@@ -105,43 +92,3 @@ class TestLabelMaps:
             sitk.WriteImage(drawn(empty, (1, shape)), str(tmp_path / f"{name}.nii.gz"))
         kidney, aorta = (np.abs(one.grid.corners()[:, 2]).max() for one in open_labels(tmp_path).maps(None))
         assert kidney + 80 <= aorta <= kidney + 85
-
-
-class TestNames:
-    def test_both_sides_are_none(self):
-        assert side_of("left and right kidney") is None and side_of("kidney") is None
-
-
-class TestSegmentations:
-    def test_what_is_meant(self, series, tmp_path):
-        """The coded property names the tissue where the label does not."""
-        mask = np.ones(series.size[::-1])
-        (one,) = open_labels(write_segmentation(tmp_path / "seg.dcm", series, {"Xidney 1": mask})).maps(None)
-        assert [(s.name, s.tissue) for s in one.segments.values()] == [("Xidney 1", "kidney")]
-
-    @pytest.fixture
-    def series(self, tmp_path):
-        return Series(tmp_path / "ct")
-
-
-class TestContours:
-    @pytest.mark.parametrize(("planes", "filled"), [((1, 2, 4), (1, 2, 3, 4)), ((0, 1, 2, 5), (0, 1, 2, 5))])
-    def test_a_plane_left_out(self, tmp_path, planes, filled):
-        """Planes stay where they were drawn; one without a contour is interpolated, more of them between
-        two ends are not.
-        """
-        series = Series(tmp_path / "ct")
-        rings = [ring(series.places(k)[5, 6], 2.6, series.direction) for k in planes]
-        path = write_structures(tmp_path / "rt.dcm", {"Kidney": rings})
-        found = by_name(open_labels(path).maps(ct_grid(series)), ct_grid(series))["Kidney"]
-        assert np.flatnonzero(found.any(axis=(1, 2))).tolist() == list(filled)
-
-    @pytest.mark.parametrize(("at", "filled"), [((0, 1, 2.4), (1, 2, 3)), ((0, 1.4, 2, 3), (1, 2, 3, 4))])
-    def test_uneven_planes(self, tmp_path, at, filled):
-        """They are interpolated onto the CT's."""
-        series = Series(tmp_path / "ct")
-        middle = series.places(1)[5, 6]
-        rings = [ring(middle + n * series.gap * series.direction[:, 2], 2.6, series.direction) for n in at]
-        path = write_structures(tmp_path / "rt.dcm", {"Kidney": rings})
-        found = by_name(open_labels(path).maps(ct_grid(series)), ct_grid(series))["Kidney"]
-        assert np.flatnonzero(found.any(axis=(1, 2))).tolist() == list(filled)

@@ -6,7 +6,7 @@ import numpy as np
 import pydicom
 import pytest
 import SimpleITK as sitk
-from dicom_series import PERSON, Series, write_segmentation, write_structures
+from dicom_series import PERSON, Series, edited, write_segmentation, write_structures
 from synthetic_body import DIRECTIONS
 from test_readers_labels import ct_grid, ring
 
@@ -44,140 +44,124 @@ def references(text):
     ],
 )  # fmt: skip
 def test_what_belongs_to_a_ct(labels, fault, doubt):
-    found = references(labels)
-    assert (fault in mismatch(found, CT)) and bool(fault) == bool(mismatch(found, CT))
-    notes = () if fault else doubts(found, CT)
+    refers = references(labels)
+    assert (fault in mismatch(refers, CT)) and bool(fault) == bool(mismatch(refers, CT))
+    notes = () if fault else doubts(refers, CT)
     assert bool(notes) == bool(doubt) and doubt in " ".join(notes)
 
 
-class TestStructures:
-    @pytest.fixture
-    def series(self, tmp_path):
-        made = Series(tmp_path / "ct", DIRECTIONS["identity"])
-        made.write()
-        return made
+@pytest.fixture
+def series(tmp_path):
+    made = Series(tmp_path / "ct", DIRECTIONS["identity"])
+    made.write()
+    return made
 
-    def drawn(self, series, tmp_path, **options):
-        path = write_structures(
-            tmp_path / "rt.dcm", {"Kidney": [ring(series.places(2)[5, 6], 2.6, series.direction)]}, **options
-        )
-        return volume_of_labels(tmp_path / "ct", [open_labels(path)])
 
-    def test_of_this_ct(self, series, tmp_path):
-        frame = series.frame_of_reference
-        for options in (
-            dict(frame_of_reference=frame, series_uid=series.uid, sops=series.sops),
-            dict(series_uid=series.uid), dict(sops=series.sops[2:3]), dict(frame_of_reference=frame), {},
-        ):  # fmt: skip
-            assert self.drawn(series, tmp_path, **options).notes == ()
+def contour_names(sop):
+    """The first contour of a structure set names a slice."""
 
-    def test_of_another_reconstruction(self, series, tmp_path):
-        volume = self.drawn(
-            series, tmp_path, frame_of_reference=series.frame_of_reference, series_uid="1.2.3", sops=["1.2.4"]
-        )
-        assert "another series of this CT's frame of reference" in " ".join(volume.notes)
+    def edit(data):
+        image = pydicom.Dataset()
+        image.ReferencedSOPInstanceUID = sop
+        data.ROIContourSequence[0].ContourSequence[0].ContourImageSequence = [image]
 
-    @pytest.mark.parametrize(
-        "options", [{"frame_of_reference": "1.2.3"}, {"series_uid": "1.2.3"}, {"sops": ["1.2.3", "1.2.4"]}]
+    return edit
+
+
+def names_its_study_alone(data):
+    del data.ReferencedFrameOfReferenceSequence[0].RTReferencedStudySequence[0].RTReferencedSeriesSequence
+
+
+EVERYTHING = dict(frame_of_reference="1.2", series_uid="1.3", sops=["1.4", "1.5"])
+# Options of a structure set, and what it refers to: frame, series, slices.
+STRUCTURES = {
+    "all": (EVERYTHING, "1.2", "1.3", ["1.4", "1.5"]),
+    "series": (dict(series_uid="1.3"), "", "1.3", []),
+    "slices": (dict(sops=["1.4"]), "", "", ["1.4"]),
+    "frame": (dict(frame_of_reference="1.2"), "1.2", "", []),
+    "nothing": ({}, "", "", []),
+    "slices of contours": (dict(edit=contour_names("1.4")), "", "", ["1.4"]),
+    "a study, which is no slice": (dict(series_uid="1.3", edit=names_its_study_alone), "", "", []),
+}
+
+
+def structures(folder, series, **options):
+    circle = ring(series.places(2)[5, 6], 2.6, series.direction)
+    return write_structures(folder / "rt.dcm", {"Kidney": [circle]}, **options)
+
+
+@pytest.mark.parametrize("case", STRUCTURES)
+def test_what_structures_refer_to(series, tmp_path, case):
+    options, frame, uid, sops = STRUCTURES[case]
+    expected = DicomReferences(
+        frozenset(filter(None, [frame])), frozenset(filter(None, [uid])), frozenset(sops), PERSON["PatientID"]
     )
-    def test_of_another_ct(self, series, tmp_path, options):
-        with pytest.raises(PatientError, match="expected the CT that they were drawn on") as caught:
-            self.drawn(series, tmp_path, **options)
-        assert "1.2.3" not in str(caught.value)
-
-    def test_frame_of_the_ct_alone(self, series, tmp_path):
-        """Of the labels it is absent: then their series counts."""
-        other = Series(tmp_path / "other")
-        with pytest.raises(PatientError, match="refer to another series"):
-            self.drawn(series, tmp_path, series_uid=other.uid, sops=other.sops)
-
-    def test_slices_that_the_contours_alone_name(self, series, tmp_path):
-        def edit(sop):
-            def change(data):
-                image = pydicom.Dataset()
-                image.ReferencedSOPInstanceUID = sop
-                data.ROIContourSequence[0].ContourSequence[0].ContourImageSequence = [image]
-
-            return change
-
-        assert self.drawn(series, tmp_path, edit=edit(series.sops[2])).notes == ()
-        with pytest.raises(PatientError, match="refer to another series"):
-            self.drawn(series, tmp_path, edit=edit("1.2.3"))
-
-    def test_a_study_is_no_slice(self, series, tmp_path):
-        """Some structure sets name the study alone."""
-
-        def edit(data):
-            del (
-                data.ReferencedFrameOfReferenceSequence[0]
-                .RTReferencedStudySequence[0]
-                .RTReferencedSeriesSequence
-            )
-
-        assert self.drawn(series, tmp_path, edit=edit, series_uid="1.2.3").notes == ()
-
-    def test_patients_without_anything_in_common(self, series, tmp_path):
-        with pytest.raises(PatientError, match="another patient ID") as caught:
-            self.drawn(series, tmp_path, edit=lambda data: setattr(data, "PatientID", "Roe-17"))
-        assert "Roe-17" not in str(caught.value) and PERSON["PatientID"] not in str(caught.value)
-
-    def test_regions_of_two_frames(self, series, tmp_path):
-        def edit(data):
-            data.StructureSetROISequence[1].ReferencedFrameOfReferenceUID = "1.2.3"
-
-        circle = [ring(series.places(2)[5, 6], 2.6, series.direction)]
-        path = write_structures(
-            tmp_path / "rt.dcm",
-            {"Kidney": circle, "GTV": circle},
-            frame_of_reference=series.frame_of_reference,
-            edit=edit,
-        )
-        with pytest.raises(PatientError, match="regions are in 2 frames of reference"):
-            open_labels(path)
+    assert open_labels(structures(tmp_path, series, **options)).references == expected
 
 
-class TestSegmentations:
-    """Without a frame of reference, or with one of its own, the series and slices count."""
+def segmentation(path, series, name="Kidney"):
+    return write_segmentation(path, series, {name: np.ones(series.size[::-1])})
 
-    @pytest.fixture
-    def pair(self, tmp_path):
-        own, other = Series(tmp_path / "ct"), Series(tmp_path / "other")
-        own.write()
-        return own, other
 
-    def drawn(self, series, tmp_path, edit):
-        path = write_segmentation(tmp_path / "seg.dcm", series, {"Kidney": np.ones(series.size[::-1])})
-        data = pydicom.dcmread(path)
-        edit(data)
-        data.save_as(path)
-        return volume_of_labels(tmp_path / "ct", [open_labels(path)])
+def without_frame(data):
+    data.FrameOfReferenceUID = None
 
-    @pytest.mark.parametrize("frame", [None, "1.2.3"])
-    def test_frame_that_is_missing_or_replaced(self, pair, tmp_path, frame):
-        def edit(data):
-            data.FrameOfReferenceUID = frame
 
-        own, other = pair
-        notes = " ".join(self.drawn(own, tmp_path, edit).notes)
-        assert ("another frame of reference" in notes) == (frame is not None)
-        with pytest.raises(PatientError, match="expected the CT that they were drawn on"):
-            self.drawn(other, tmp_path, edit)
+def without_series(data):
+    del data.ReferencedSeriesSequence
 
-    def test_slices_that_the_frames_alone_name(self, pair, tmp_path):
-        def edit(data):
-            del data.ReferencedSeriesSequence, data.FrameOfReferenceUID
 
-        own, other = pair
-        assert self.drawn(own, tmp_path, edit).notes == ()
-        with pytest.raises(PatientError, match="refer to another series"):
-            self.drawn(other, tmp_path, edit)
+@pytest.mark.parametrize("edit", [without_frame, without_series])
+def test_what_a_segmentation_refers_to(series, tmp_path, edit):
+    """Its frames name their slices, too."""
+    references = open_labels(edited(segmentation(tmp_path / "seg.dcm", series), edit)).references
+    assert references.frames == (set() if edit is without_frame else {series.frame_of_reference})
+    assert references.series == (set() if edit is without_series else {series.uid})
+    assert references.instances == set(series.sops)
 
-    def test_no_place_in_the_patient(self, pair, tmp_path):
-        def edit(data):
-            del data.SharedFunctionalGroupsSequence[0].PlaneOrientationSequence
 
-        with pytest.raises(PatientError, match="belongs to no volume"):
-            self.drawn(pair[0], tmp_path, edit)
+def without_place(data):
+    del data.SharedFunctionalGroupsSequence[0].PlaneOrientationSequence
+
+
+def test_a_segmentation_without_a_place_in_the_patient(series, tmp_path):
+    path = edited(segmentation(tmp_path / "seg.dcm", series), without_place)
+    with pytest.raises(PatientError, match="belongs to no volume"):
+        volume_of_labels(tmp_path / "ct", [open_labels(path)])
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (dict(frame_of_reference="1.2.3"), "another frame of reference"),
+        (dict(series_uid="1.2.3"), "refer to another series"),
+        (dict(edit=lambda data: setattr(data, "PatientID", "Roe-17")), "another patient ID"),
+    ],
+)
+def test_labels_of_another_ct_are_refused_without_its_identifiers(series, tmp_path, options, words):
+    labels = open_labels(structures(tmp_path, series, **options))
+    with pytest.raises(PatientError, match=f"{words}.*expected the CT that they were drawn on") as caught:
+        volume_of_labels(tmp_path / "ct", [labels])
+    assert not any(part in str(caught.value) for part in ("1.2.3", "Roe-17", PERSON["PatientID"]))
+
+
+def test_labels_of_another_reconstruction_are_taken_with_a_note(series, tmp_path):
+    frame = series.frame_of_reference
+    labels = open_labels(structures(tmp_path, series, frame_of_reference=frame, series_uid="1.2.3"))
+    notes = volume_of_labels(tmp_path / "ct", [labels]).notes
+    assert "another series of this CT's frame of reference" in " ".join(notes)
+
+
+def test_regions_of_two_frames(series, tmp_path):
+    def edit(data):
+        data.StructureSetROISequence[1].ReferencedFrameOfReferenceUID = "1.2.3"
+
+    frame = series.frame_of_reference
+    path = write_structures(
+        tmp_path / "rt.dcm", {"Kidney": [], "GTV": []}, frame_of_reference=frame, edit=edit
+    )
+    with pytest.raises(PatientError, match="regions are in 2 frames of reference"):
+        open_labels(path)
 
 
 class TestTwoPatients:
@@ -239,12 +223,9 @@ class TestTwoPatients:
 
     @pytest.mark.parametrize("n", [0, 1])
     def test_a_patient_id(self, pair, ct, tmp_path, n):
-        path = write_structures(
-            tmp_path / "rt.dcm", {"Kidney": []}, edit=lambda data: setattr(data, "PatientID", f"Roe-{n + 1}")
-        )
-        self.assert_taken(
-            volume_of_labels(ct, [open_labels(path)]), pair[n], "the labels have its patient ID"
-        )
+        edit = lambda data: setattr(data, "PatientID", f"Roe-{n + 1}")  # noqa: E731
+        labels = open_labels(write_structures(tmp_path / "rt.dcm", {"Kidney": []}, edit=edit))
+        self.assert_taken(volume_of_labels(ct, [labels]), pair[n], "the labels have its patient ID")
 
     def label_map(self, path, series, box=(slice(None),) * 3, flipped=False):
         grid = ct_grid(series)
@@ -252,8 +233,7 @@ class TestTwoPatients:
         sitk.WriteImage(sitk.Flip(image, [True, True, False]) if flipped else image, str(path))
         return open_labels(path)
 
-    @pytest.mark.parametrize("n", [0, 1])
-    @pytest.mark.parametrize("flipped", [False, True])
+    @pytest.mark.parametrize(("n", "flipped"), [(0, False), (1, True)])
     def test_voxels_of_a_label_map(self, pair, ct, tmp_path, n, flipped):
         labels = self.label_map(tmp_path / "kidney.nii.gz", pair[n], flipped=flipped)
         self.assert_taken(volume_of_labels(ct, [labels]), pair[n], "the labels have its voxels")
@@ -286,10 +266,10 @@ class TestLabelsBesideTheCt:
     @pytest.fixture
     def requested(self, monkeypatch):
         """The CT and the labels that a request reads."""
-        found = []
+        volumes = []
 
         def stop(volume, *_, **__):
-            found.append(volume)
+            volumes.append(volume)
             raise PatientError("read")
 
         monkeypatch.setattr("scenes.patients.import_request.import_patient", stop)
@@ -297,7 +277,7 @@ class TestLabelsBesideTheCt:
         def request(*arguments, **options):
             with pytest.raises(PatientError, match="^read$"):
                 import_request(*arguments, **options)
-            return found[-1]
+            return volumes[-1]
 
         return request
 
@@ -309,11 +289,8 @@ class TestLabelsBesideTheCt:
                 tmp_path / "in" / f"ct{n}", DIRECTIONS["identity"], number=n, size=(12, 10, 5 + n)
             )
             series.write(PatientID=f"Roe-{n}")
-            file = tmp_path / "in" / f"seg{n}.dcm"
-            write_segmentation(file, series, {f"Kidney {n}": np.ones(series.size[::-1])})
-            data = pydicom.dcmread(file)
-            data.PatientID = f"Roe-{n}"
-            data.save_as(file)
+            file = segmentation(tmp_path / "in" / f"seg{n}.dcm", series, f"Kidney {n}")
+            edited(file, lambda data, n=n: setattr(data, "PatientID", f"Roe-{n}"))
             made.append(series)
         return made
 
@@ -337,15 +314,9 @@ class TestLabelsBesideTheCt:
 
     def test_of_one_patient(self, pair, tmp_path):
         """Both belong to the CT: the user chooses."""
-        write_segmentation(
-            tmp_path / "in" / "ct1" / "a.dcm", pair[0], {"Kidney": np.ones(pair[0].size[::-1])}
-        )
-        write_segmentation(
-            tmp_path / "in" / "ct1" / "b.dcm", pair[0], {"Kidney": np.ones(pair[0].size[::-1])}
-        )
-        with pytest.raises(
-            PatientError, match="2 segmentations and structure sets were found: .*a.dcm.*b.dcm"
-        ):
+        for name in ("a.dcm", "b.dcm"):
+            segmentation(tmp_path / "in" / "ct1" / name, pair[0])
+        with pytest.raises(PatientError, match="2 segmentations .* were found: .*a.dcm.*b.dcm"):
             import_request(tmp_path / "in" / "ct1")
 
     def test_of_none(self, pair, tmp_path):

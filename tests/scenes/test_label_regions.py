@@ -24,7 +24,7 @@ from test_readers_labels import by_name, ct_grid, ring
 from scenes.patients.readers import dicom_seg
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import NEAR_MM
-from scenes.patients.readers.segment_names import is_needless, is_public
+from scenes.patients.readers.segment_names import is_needless
 
 NEEDLESS = [
     "BODY", "Body", "External", "external_1", "Skin", "Patient", "Patient "
@@ -42,17 +42,6 @@ NEEDED = [
 def test_needless_names():
     assert [name for name in NEEDLESS if not is_needless(name)] == []
     assert [name for name in NEEDED if is_needless(name)] == []
-
-
-def test_names_of_structures_alone():
-    """They identify nobody."""
-    of_structures = (
-        "adrenal_gland_left|Niere links|vertebrae_L2|kidneyL|Kidney "
-        "2|BODY|left|Segment_1|portal_vein_and_splenic_vein|"
-    )
-    assert [name for name in of_structures.split("|") if not is_public(name)] == []
-    of_persons = "Doe|kidney Doe|Doe_left|kidney 19600229|Mr L"
-    assert [name for name in of_persons.split("|") if is_public(name)] == []
 
 
 def points_between(start, end):
@@ -77,8 +66,8 @@ class TestStructures:
         circles = self.circles(series)
         regions = dict.fromkeys(("Kidney", "BODY", "liver", "heart", "spleen", "x"), circles)
         path = write_structures(tmp_path / "rt.dcm", regions)
-        drawing, found = self.read(series, path)
-        assert set(found) == {"Kidney", "liver", "spleen", "x"}
+        drawing, labelled = self.read(series, path)
+        assert set(labelled) == {"Kidney", "liver", "spleen", "x"}
         assert drawing.notes == (
             "not read, as they are far from the kidneys or no organ: 2 “BODY”, 4 “heart”",
         )
@@ -87,8 +76,8 @@ class TestStructures:
     def test_what_the_user_names_is_filled(self, series, tmp_path, word):
         circles = self.circles(series)
         path = write_structures(tmp_path / "rt.dcm", {"Kidney": circles, "BODY": circles, "heart": circles})
-        drawing, found = self.read(series, path, wanted=[word])
-        assert set(found) == {"Kidney", "BODY"} and np.array_equal(found["BODY"], found["Kidney"])
+        drawing, labelled = self.read(series, path, wanted=[word])
+        assert set(labelled) == {"Kidney", "BODY"} and np.array_equal(labelled["BODY"], labelled["Kidney"])
         assert drawing.notes == ("not read, as they are far from the kidneys or no organ: 3 “heart”",)
 
     @pytest.mark.parametrize(
@@ -137,8 +126,8 @@ class TestStructures:
         the voxels that cover it.
         """
         turned = DIRECTIONS[direction]
-        series = Series(tmp_path, turned, size=(60, 60, 60), gap=5.0, origin=turned @ np.full(3, -147.5))
-        series.spacing = (5.0, 5.0)
+        origin = turned @ np.full(3, -147.5)
+        series = Series(tmp_path, turned, size=(60, 60, 60), gap=5.0, origin=origin, spacing=(5.0, 5.0))
         middle = ct_grid(series).place([[29.5, 29.5, k] for k in range(60)])
         kidney = [ring(middle[k], 12.0, turned) for k in (29, 30)]
         shown = []
@@ -154,14 +143,14 @@ class TestStructures:
         points = np.concatenate(kidney)
         low, high = points.min(axis=0) - NEAR_MM, points.max(axis=0) + NEAR_MM
         box = ct_grid(series).box_around(low, high)
-        found = by_name(maps, ct_grid(series))["x"]
+        labelled = by_name(maps, ct_grid(series))["x"]
         radius = np.stack([np.linalg.norm(series.places(k) - middle[k], axis=-1) for k in range(60)])
-        near = np.zeros(found.shape, bool)
+        near = np.zeros(labelled.shape, bool)
         near[box[::-1]] = True
         assert near.sum() < 0.8 * near.size
         # The circle's 360 corners cut off 5 um.
-        assert found[near & (radius < 139.9)].all() and not found[near & (radius > 140.1)].any()
-        assert not found[~near].any()
+        assert labelled[near & (radius < 139.9)].all() and not labelled[near & (radius > 140.1)].any()
+        assert not labelled[~near].any()
         assert filled["Kidney"].values.any(axis=(1, 2)).sum() == 2
         planes = near.any(axis=(1, 2)).sum()
         assert [("contours", 2), ("contours", planes)] == [one for one in shown if one[0] == "contours"]
@@ -171,23 +160,24 @@ class TestStructures:
         """As skimage fills it, also where it crosses itself and has corners and edges on pixels; of
         oblique ones skimage misses some.
         """
-        series = Series(tmp_path / "ct", DIRECTIONS["identity"], size=(70, 60, 4), origin=(0, 0, 0))
-        series.spacing = (1.0, 1.0)
+        series = Series(
+            tmp_path, DIRECTIONS["identity"], size=(70, 60, 4), origin=(0, 0, 0), spacing=(1.0, 1.0)
+        )
         drawn = np.random.default_rng(corners).integers(-8, 75, (3, corners, 2))
-        contours = [np.column_stack([each, np.full(corners, 2.5 * k)]) for k, each in enumerate(drawn)]
+        contours = [np.column_stack([outline, np.full(corners, 2.5 * k)]) for k, outline in enumerate(drawn)]
         path = write_structures(tmp_path / "rt.dcm", {"Kidney": contours})
         (filled,) = open_labels(path).maps(ct_grid(series))
         expected = np.zeros((3, 200, 200), bool)
-        for plane, each in zip(expected, drawn, strict=True):
-            plane[polygon(each[:, 1] + 50, each[:, 0] + 50, plane.shape)] = True
+        for plane, outline in zip(expected, drawn, strict=True):
+            plane[polygon(outline[:, 1] + 50, outline[:, 0] + 50, plane.shape)] = True
             on = np.concatenate(
-                [points_between(*ends) for ends in zip(each, np.roll(each, -1, axis=0), strict=True)]
+                [points_between(*ends) for ends in zip(outline, np.roll(outline, -1, axis=0), strict=True)]
             )
             plane[on[:, 1] + 50, on[:, 0] + 50] = True
-        found = np.zeros_like(expected)
+        labelled = np.zeros_like(expected)
         at = np.rint(filled.grid.place(np.argwhere(filled.values)[:, ::-1]) / (1, 1, 2.5)).astype(int)
-        found[at[:, 2], at[:, 1] + 50, at[:, 0] + 50] = True
-        assert np.array_equal(found, expected)
+        labelled[at[:, 2], at[:, 1] + 50, at[:, 0] + 50] = True
+        assert np.array_equal(labelled, expected)
 
     def test_without_a_kidney_all_is_filled(self, series, tmp_path):
         path = write_structures(tmp_path / "rt.dcm", {"x": self.circles(series, range(6))})

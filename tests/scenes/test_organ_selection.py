@@ -5,7 +5,7 @@ import pytest
 import SimpleITK as sitk
 from scipy.spatial import cKDTree
 from synthetic_body import BODY, LEFT, RIGHT, body, drawn, grid_around, with_voxels
-from test_patient_import import found, imported
+from test_patient_import import imported, organ_taken
 
 import scenes.patients.patient_import
 from errors import PatientError
@@ -92,7 +92,7 @@ class TestOrgan:
         ]
         labels = drawn(empty, *((1, half) for half in halves))
         with pytest.raises(PatientError, match="2 organs are labelled"):
-            found(drawn(empty, (40, BODY)), labels, [1], "left")
+            organ_taken(drawn(empty, (40, BODY)), labels, [1], "left")
 
     def test_ct_without_a_negative_value(self, ct_and_labels):
         ct, labels = ct_and_labels
@@ -135,17 +135,17 @@ class TestParts:
 
 
 def test_vessels_are_no_bed(ct_and_labels, monkeypatch):
-    given = {}
+    taken = {}
     monkeypatch.setattr(
         scenes.patients.patient_import,
         "bed_of_labels",
-        lambda organ, labels, own, gravity: given.update(own=own) or organ,
+        lambda organ, labels, own, gravity: taken.update(own=own) or organ,
     )
     ct, labels = ct_and_labels
     vessel = LEFT[0] + [0, 30, 0], np.array([20.0, 8.0, 40.0])
     named = LabelMap.of(drawn(labels, (4, vessel), (2, LEFT)), {2: "kidney_left", 4: "renal vein"})
     import_patient(LazyVolume.of(ct), named, margin_mm=5.0, support="labels")
-    assert set(given["own"]) == {2, 4}
+    assert set(taken["own"]) == {2, 4}
 
 
 def test_marks_of_the_organ_alone(ct_and_labels, monkeypatch):

@@ -3,11 +3,10 @@
 import inspect
 
 import numpy as np
-import pydicom
 import pytest
 import SimpleITK as sitk
 from conftest import DATA
-from dicom_series import Series
+from dicom_series import Series, edited
 from pydicom.dataset import Dataset
 from synthetic_body import body, coarsely, level, points_of, with_voxels
 
@@ -52,38 +51,36 @@ class TestHeader:
         assert position == "prone" and "lying prone, as given" in note and "HFS" in note
         assert position_of("HFP", "prone") == position_of("", "prone") == ("prone", ())
 
-    @pytest.mark.parametrize(("term", "read"), [("FFDL", "FFDL"), ("hfp ", "HFP"), ("", "")])
+    @pytest.mark.parametrize(("term", "read"), [("FFDL", "FFDL"), ("hfp ", "HFP"), ("", ""), (None, "")])
     def test_of_slices(self, tmp_path, term, read):
-        assert open_ct(Series(tmp_path).write(PatientPosition=term)).patient_position == read
+        tags = {} if term is None else dict(PatientPosition=term)
+        assert open_ct(Series(tmp_path).write(**tags)).patient_position == read
 
-    def test_absent(self, tmp_path):
-        assert open_ct(Series(tmp_path).write()).patient_position == ""
-
-    def test_slices_without_one_do_not_count(self, tmp_path):
+    @pytest.mark.parametrize(
+        ("other", "read", "words"), [("", "HFP", ""), ("HFS", "", "different PatientPositions")]
+    )
+    def test_of_slices_that_differ(self, tmp_path, other, read, words):
+        """Those without one do not count."""
         series = Series(tmp_path)
-        series.write(edit=lambda data, k: setattr(data, "PatientPosition", "HFP" if k else ""))
+        series.write(edit=lambda data, k: setattr(data, "PatientPosition", "HFP" if k else other))
         volume = open_ct(tmp_path)
-        assert volume.patient_position == "HFP" and volume.notes == ()
-
-    def test_slices_that_disagree(self, tmp_path):
-        series = Series(tmp_path)
-        series.write(edit=lambda data, k: setattr(data, "PatientPosition", "HFS" if k else "HFP"))
-        volume = open_ct(tmp_path)
-        assert volume.patient_position == "" and "different PatientPositions" in " ".join(volume.notes)
+        assert volume.patient_position == read and bool(volume.notes) == bool(words)
+        assert words in " ".join(volume.notes)
 
     @pytest.mark.parametrize("shared", [True, False, None])
     def test_enhanced(self, tmp_path, shared):
         """In the shared functional groups, in each frame's, or in the file's own header."""
-        data = pydicom.dcmread(file := Series(tmp_path).write_enhanced())
         group = Dataset()
         group.PatientPosition = "FFP"
-        frames = data.PerFrameFunctionalGroupsSequence
-        for holder in data.SharedFunctionalGroupsSequence if shared else [] if shared is None else frames:
-            holder.CTPositionSequence = [group]
-        if shared is None:
-            data.PatientPosition = "FFP"
-        data.save_as(file)
-        assert open_ct(file).patient_position == "FFP"
+
+        def edit(data):
+            shared_groups, frames = data.SharedFunctionalGroupsSequence, data.PerFrameFunctionalGroupsSequence
+            for holder in {True: shared_groups, False: frames, None: []}[shared]:
+                holder.CTPositionSequence = [group]
+            if shared is None:
+                data.PatientPosition = "FFP"
+
+        assert open_ct(edited(Series(tmp_path).write_enhanced(), edit)).patient_position == "FFP"
 
 
 @pytest.mark.parametrize("position", ["prone", "left-decubitus"])
@@ -123,19 +120,19 @@ def test_the_side_of_a_decubitus_position_is_down():
 
 
 def test_the_option_has_four_words_and_reaches_the_import(tmp_path, capfd, monkeypatch):
-    asked = {}
+    arguments = {}
 
     def request(*values, **named):
-        asked.update(inspect.signature(import_request).bind(*values, **named).arguments)
+        arguments.update(inspect.signature(import_request).bind(*values, **named).arguments)
         raise PatientError("enough")
 
     monkeypatch.setattr("scenes.patients.import_request.import_request", request)
     command = ["import", "ct", "labels", "--out", str(tmp_path / "p"), "--position"]
-    assert main([*command, "left"]) == 2 and not asked
+    assert main([*command, "left"]) == 2 and not arguments
     printed = capfd.readouterr().err
     assert all(position in printed for position in POSITIONS)
     assert main([*command, "left-decubitus"]) == 2
-    assert asked["position"] == "left-decubitus" and asked["seed_mm"] is None
+    assert arguments["position"] == "left-decubitus" and arguments["seed_mm"] is None
 
 
 class Trunk:

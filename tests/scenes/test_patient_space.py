@@ -2,7 +2,6 @@
 may say it.
 """
 
-import gzip
 from pathlib import Path
 
 import nibabel
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 import trimesh
+from raw_nrrd import write_nrrd
 from synthetic_body import DIRECTIONS, LEFT, TUMOUR, body, coarsely
 
 from app import main
@@ -34,24 +34,8 @@ def coarse(monkeypatch):
 
 def nrrd(path: Path, image: sitk.Image, field: str, signs: np.ndarray) -> Path:
     """An NRRD whose axes are those of an image, in a space of the given signs."""
-    grid, voxels = VoxelGrid.of(image), sitk.GetArrayFromImage(image).astype(np.int16)
-    vectors = signs[:, None] * grid.direction * grid.spacing
-
-    def words(vector: np.ndarray) -> str:
-        return "(" + ",".join(map(repr, vector.tolist())) + ")"
-
-    lines = [
-        "NRRD0004",
-        "type: short",
-        "dimension: 3",
-        *filter(None, [field]),
-        f"sizes: {' '.join(map(str, grid.size))}",
-    ]
-    lines += ["space directions: " + " ".join(words(vector) for vector in vectors.T)]
-    lines += ["kinds: domain domain domain", "endian: little", "encoding: gzip"]
-    lines += [f"space origin: {words(signs * grid.origin)}"]
-    path.write_bytes("\n".join(lines).encode() + b"\n\n" + gzip.compress(voxels.tobytes()))
-    return path
+    voxels = sitk.GetArrayFromImage(image).astype(np.int16)
+    return write_nrrd(path, VoxelGrid.of(image), voxels, field, signs)
 
 
 def without_matrix(path: Path, image: sitk.Image) -> Path:

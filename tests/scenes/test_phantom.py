@@ -72,11 +72,8 @@ def test_it_is_the_patient_of_the_documents(phantom, labels, hu):
         own = labels == label
         assert own.sum() == pytest.approx(count, abs=4), label
         assert _positions(own, phantom[1]).mean(axis=0) == pytest.approx(place, abs=0.015), label
-    assert hu.mean() == pytest.approx(-1.706, abs=0.01)
-
-
-def test_every_label_occurs_and_no_other(labels):
     assert set(np.unique(labels)) == set(Label)
+    assert hu.mean() == pytest.approx(-1.706, abs=0.01)
 
 
 def test_kidney_has_the_size_of_a_kidney(phantom, labels, spacing):
@@ -97,17 +94,6 @@ def test_tumour_is_25_mm_and_partly_exophytic(labels, spacing):
     coarse = np.s_[::3, ::3, ::3]
     rest = convex_hull_image(((labels > 0) & ~tumour)[coarse])
     assert 0.15 < (tumour[coarse] & ~rest).sum() / tumour[coarse].sum() < 0.6
-
-
-def test_tumour_faces_the_front_below_the_middle_on_the_lateral_side(phantom, labels):
-    tumour = _positions(labels == Label.TUMOUR, phantom[1]).mean(axis=0)
-    kidney = _positions(labels > 0, phantom[1]).mean(axis=0)
-    assert tumour[0] > kidney[0] + 5
-    assert tumour[1] < kidney[1] - 5
-    assert -40 < tumour[2] - kidney[2] < -5
-    i, _, k = phantom[1].TransformPhysicalPointToIndex(tumour)
-    column = labels[k, :, i]
-    assert column[np.argmax(column > 0)] == Label.TUMOUR
 
 
 def test_union_is_one_solid_without_cavities(labels):
@@ -166,27 +152,6 @@ def test_noise_has_its_sd_and_is_correlated(hu, labels):
 
     assert 0.9 * NOISE_SD < sd(4) < 1.25 * NOISE_SD
     assert sd(1) < 0.8 * sd(4)
-
-
-def test_hilum_opens_medially_and_to_the_front(phantom, labels, spacing):
-    """The deepest dent of a left kidney lies toward -x, and not behind its centre."""
-    organ = (labels > 0)[::3, ::3, ::3]
-    dent = convex_hull_image(organ) & ~organ
-    depth = ndimage.distance_transform_edt(dent)
-    deepest = np.array(np.unravel_index(depth.argmax(), depth.shape))[::-1] * 3 * spacing
-    hilum = deepest + np.array(phantom[1].GetOrigin())
-    kidney = _positions(labels > 0, phantom[1]).mean(axis=0)
-    assert hilum[0] < kidney[0] - 12
-    assert hilum[1] < kidney[1]
-    assert abs(hilum[2] - kidney[2]) < 20
-
-
-def test_upper_pole_leans_medially_and_backward(phantom, labels):
-    points = _positions(labels > 0, phantom[1])
-    low, high = np.quantile(points[:, 2], (0.15, 0.85))
-    lower, upper = points[points[:, 2] < low].mean(axis=0), points[points[:, 2] > high].mean(axis=0)
-    assert upper[0] < lower[0] - 10
-    assert upper[1] > lower[1] + 5
 
 
 def test_calyces_and_vessels_lie_within_the_kidney_or_a_few_mm_out_of_the_hilum(phantom, labels):

@@ -5,16 +5,14 @@ images are reported.
 import shutil
 
 import numpy as np
-import pydicom
 import pytest
-from dicom_series import Series, read_ct, refusal, save, write_dicomdir, zipped
+from dicom_series import Series, edited, read_ct, refusal, save, write_dicomdir, zipped
 from pydicom.datadict import dictionary_VR
 from pydicom.dataelem import RawDataElement
 from pydicom.tag import Tag
 from pydicom.uid import (
     DeflatedExplicitVRLittleEndian,
     ExplicitVRBigEndian,
-    ExplicitVRLittleEndian,
     ImplicitVRLittleEndian,
     generate_uid,
 )
@@ -62,22 +60,19 @@ class TestSeries:
         assert assert_whole(series, tmp_path).notes == ()
 
     @pytest.mark.parametrize(
-        "syntax",
-        [ImplicitVRLittleEndian, ExplicitVRLittleEndian, ExplicitVRBigEndian, DeflatedExplicitVRLittleEndian],
+        "options",
+        [
+            dict(syntax=ImplicitVRLittleEndian),
+            dict(syntax=ExplicitVRBigEndian),
+            dict(syntax=DeflatedExplicitVRLittleEndian),
+            dict(name="part{k}/IM{n}"),
+            dict(preamble=False, name="IM{n}"),
+        ],
+        ids=["implicit", "big endian", "deflated", "subfolders", "no preamble"],
     )
-    def test_transfer_syntaxes(self, tmp_path, syntax):
+    def test_any_form_of_files(self, tmp_path, options):
         series = Series(tmp_path)
-        series.write(SHUFFLED, syntax)
-        assert_whole(series, tmp_path)
-
-    def test_subfolders_and_no_extension(self, tmp_path):
-        series = Series(tmp_path)
-        series.write(SHUFFLED, name="part{k}/IM{n}")
-        assert_whole(series, tmp_path)
-
-    def test_without_preamble(self, tmp_path):
-        series = Series(tmp_path)
-        series.write(preamble=False, name="IM{n}")
+        series.write(SHUFFLED, **options)
         assert_whole(series, tmp_path)
 
     def test_medium(self, tmp_path):
@@ -103,21 +98,20 @@ class TestSeries:
         assert_whole(series, tmp_path)
 
     def test_enhanced_without_places(self, tmp_path):
-        file = Series(tmp_path).write_enhanced()
-        data = pydicom.dcmread(file)
-        del data.PerFrameFunctionalGroupsSequence
-        data.save_as(file)
-        assert "6 frames without positions" in refusal(file)
+        edit = lambda data: delattr(data, "PerFrameFunctionalGroupsSequence")  # noqa: E731
+        assert "6 frames without positions" in refusal(edited(Series(tmp_path).write_enhanced(), edit))
 
     @pytest.mark.parametrize(
-        ("slope", "intercept", "signed"), [(0.5, -1000.5, False), (2, 10, True), (1, 0, True)]
+        ("slope", "intercept", "signed"),
+        [(0.5, -1000.5, False), (2, 10, True), (1, 0, True), (0.4, -1000, False), (0.3, -1000, False)],
     )
     def test_rescale(self, tmp_path, slope, intercept, signed):
         series = Series(tmp_path, slope=slope, intercept=intercept, signed=signed)
         series.write()
         _, voxels = read_ct(tmp_path)
         exact = series.stored * slope + intercept
-        assert np.abs(voxels - exact).max() <= 0.5
+        # Slopes that are no binary fractions are rounded themselves.
+        assert np.abs(voxels - exact).max() <= 0.5 + 1e-3 * (slope % 0.5 > 0)
 
     def test_part_of_a_series(self, tmp_path):
         series = Series(tmp_path)
@@ -249,14 +243,6 @@ class TestGeometry:
         assert np.abs(voxels - bump(places))[inside].max() <= tolerance
         assert (voxels[outside] == AIR).all() and outside.any()
 
-    def test_one_slice_out_of_line(self, tmp_path):
-        """A wrong place is no tilt: 20 mm to the side of its neighbours."""
-        series = Series(tmp_path)
-        at = series.positions
-        series.positions = lambda k: at(k) + (k == 2) * 20 * series.direction[:, 0]
-        series.write()
-        assert "slice 3 (s1-2.dcm)" in refusal(tmp_path)
-
     def test_steep_stack(self, tmp_path):
         """No gantry tilts by 60 degrees."""
         series = Series(tmp_path, DIRECTIONS["identity"])
@@ -310,15 +296,26 @@ class TestGeometry:
         message = refusal(Series(tmp_path, size=(12, 10, 10)).write(order))
         assert all(part in message for part in words)
 
-    def test_gap_too_small(self, tmp_path):
+    @pytest.mark.parametrize(
+        ("at", "tags", "words"),
+        [
+            # The same pixels beside their place are no copy.
+            ((2.4, 0), {}, ("slice 3 (s1-2.dcm)", "1.00 mm apart")),
+            ((2, 0.5), {}, ("slice 3 (s1-2.dcm)", "one position")),
+            ((2, 0), dict(PixelData=bytes(240)), ("slice 3 (s1-2.dcm)", "one position")),
+            ((6, 0), dict(PixelSpacing=[0.7, 0.82]), ("of different pixel spacing",)),
+            ((6, 0), dict(ImageOrientationPatient=[1, 0, 0, 0, 0, -1]), ("of different orientation",)),
+        ],
+        ids=["too close", "beside it", "other pixels", "pixel spacing", "orientation"],
+    )
+    def test_one_slice_more(self, tmp_path, at, tags, words):
         series = Series(tmp_path)
         series.write()
-        between = series.positions(2.4).round(6).tolist()
-        save(series.slice(2, ImagePositionPatient=between, InstanceNumber=30), tmp_path / "z.dcm")
+        place = series.positions(at[0]) + at[1] * series.direction[:, 0]
+        tags = dict(ImagePositionPatient=place.round(6).tolist(), InstanceNumber=30) | tags
+        save(series.slice(2, SOPInstanceUID=generate_uid(), **tags), tmp_path / "z.dcm")
         message = refusal(tmp_path)
-        assert (
-            "slice 3 (s1-2.dcm)" in message and "slice 30 (z.dcm)" in message and "1.00 mm apart" in message
-        )
+        assert all(part in message for part in (*words, "slice 30 (z.dcm)"))
 
     def test_copies_are_left_out(self, tmp_path):
         series = Series(tmp_path)
@@ -327,15 +324,6 @@ class TestGeometry:
         notes = assert_whole(series, tmp_path).notes
         # Without the file's name, which may be the patient's.
         assert notes == ("duplicates, taken once: slice 4",)
-
-    def test_conflict(self, tmp_path):
-        series = Series(tmp_path)
-        series.write()
-        other = series.slice(3, InstanceNumber=40, SOPInstanceUID=generate_uid())
-        other.PixelData = bytes(reversed(other.PixelData))
-        save(other, tmp_path / "z.dcm")
-        message = refusal(tmp_path)
-        assert "slice 4 (s1-3.dcm)" in message and "slice 40 (z.dcm)" in message and "one position" in message
 
 
 class TestRefused:
@@ -366,13 +354,6 @@ class TestRefused:
     )
     def test_headers(self, tmp_path, tags, words):
         assert words in refusal(Series(tmp_path).write(**tags))
-
-    @pytest.mark.parametrize("name", ["ImagePositionPatient", "PixelSpacing", "RescaleSlope", "Rows"])
-    def test_garbage(self, tmp_path, name):
-        def garbled(data, _):
-            data[name]._value = "Doe^Jane" if name != "Rows" else 0
-
-        refusal(Series(tmp_path).write(edit=garbled), name="s1-")
 
     @pytest.mark.parametrize(
         "name",
@@ -419,12 +400,6 @@ class TestRefused:
         assert (
             "expected no slice to be missing" in message and "left out, damaged: s1-3.dcm: has no" in message
         )
-
-    def test_mixed_orientation(self, tmp_path):
-        series = Series(tmp_path)
-        series.write(range(3))
-        Series.write(series, (3, 4, 5), name="b{n}.dcm", ImageOrientationPatient=[1, 0, 0, 0, 0, -1])
-        assert "of different orientation" in refusal(tmp_path)
 
     def test_nothing_there(self, tmp_path):
         assert "no DICOM file" in refusal(tmp_path)

@@ -5,13 +5,8 @@ several none.
 import numpy as np
 import pytest
 import SimpleITK as sitk
-from dicom_series import Series, read_ct, refusal, write_segmentation
+from dicom_series import Series, read_ct, refusal
 from test_readers import ENDINGS, noise
-
-from errors import PatientError
-from scenes.patients.import_request import import_request
-from scenes.patients.readers.ct_series import open_ct
-from scenes.patients.readers.label_files import open_labels
 
 NONE = "one that is not named as labels"
 
@@ -79,20 +74,3 @@ def test_beside_dicom_files_they_are_left_out(tmp_path):
     # A damaged series is no reason to take another file for the CT.
     (tmp_path / "s1-2.dcm").unlink()
     assert "missing" in refusal(tmp_path)
-
-
-def test_a_segmentation_beside_the_file_is_no_ct(tmp_path):
-    series = Series(tmp_path / "ct")
-    write_segmentation(tmp_path / "case" / "seg.dcm", series, {"Kidney": np.ones(series.size[::-1])})
-    folder_of(tmp_path / "case", "ct.nrrd")
-    assert np.array_equal(open_ct(tmp_path / "case").read(), sitk.GetArrayFromImage(noise()))
-    assert [
-        s.name for one in open_labels(tmp_path / "case" / "seg.dcm").maps(None) for s in one.segments.values()
-    ]
-
-
-def test_without_labels_and_without_anything(tmp_path):
-    with pytest.raises(PatientError, match="no labels are with this CT"):
-        import_request(folder_of(tmp_path / "a", "ct.nrrd"))
-    (tmp_path / "b").mkdir()
-    assert "no DICOM file found" in refusal(tmp_path / "b")

@@ -102,9 +102,17 @@ class TestDicom:
     def test_empty_files_and_other_kinds_are_passed_over(self, tmp_path):
         series = Series(tmp_path)
         series.write()
-        (tmp_path / "empty.dcm").write_bytes(b"")
-        (tmp_path / "text.dcm").write_text("Doe^Jane")
-        (tmp_path / "photo.dcm").write_bytes(b"\xff\xd8\xff\xe0\x00\x10JFIF" + bytes(400))
+        others = {
+            "empty.dcm": b"",
+            "text.dcm": b"Doe^Jane",
+            "photo.dcm": b"\xff\xd8\xff\xe0\x00\x10JFIF" + bytes(400),
+            "index.html": b"<html>" * 90,
+            "viewer.exe": b"MZ" + bytes(500),
+            "rt.jar": b"PK\3\4" + bytes(900),
+            "s1-9.dcm.crdownload": bytes(300),
+        }
+        for name, content in others.items():
+            (tmp_path / name).write_bytes(content)
         assert np.array_equal(open_ct(tmp_path).read(), series.hounsfield)
 
     @pytest.mark.parametrize("content", [b"", b"Doe^Jane", b"\xff\xd8\xff\xe0\x00\x10JFIF" + bytes(400)])
@@ -313,6 +321,17 @@ def declared(path, size=None, flags=None):
     return path
 
 
+# Its files, what its headers say of them, and the refusal.
+BOMBS = {
+    "huge entry": (lambda one: {"b.dcm": one}, dict(size=3 * 2**30), "extracts to 3 GiB"),
+    # Zeros behind a slice: a thousandth of the room that they take.
+    "packed entry": (lambda one: {"b.dcm": one + bytes(200 * MIB)}, {}, "one slice only"),
+    "larger than declared": (lambda one: {"b.dcm": one + bytes(50 * MIB)}, dict(size=1000), "b.dcm"),
+    "encrypted": (lambda one: {"b.dcm": one}, dict(flags=1), "encrypted"),
+    "line in a name": (lambda one: {"b\nc.dcm": one}, dict(flags=1), ""),
+}
+
+
 class TestArchives:
     @pytest.fixture
     def slice_bytes(self, tmp_path):
@@ -326,19 +345,21 @@ class TestArchives:
             archive(tmp_path / "a.zip", {"b.dcm": slice_bytes, name: slice_bytes})
         )
 
-    def test_huge_entry(self, tmp_path, refused, slice_bytes):
-        bomb = declared(archive(tmp_path / "a.zip", {"b.dcm": slice_bytes}), size=3 * 2**30)
-        assert "extracts to 3 GiB" in refused(bomb)
+    @pytest.mark.parametrize("bomb", BOMBS)
+    def test_bombs(self, tmp_path, refused, slice_bytes, bomb):
+        entries, said, words = BOMBS[bomb]
+        path = archive(tmp_path / "a.zip", entries(slice_bytes))
+        assert words in refused(declared(path, **said) if said else path)
 
-    def test_packed_entry(self, tmp_path, refused, slice_bytes):
-        """Zeros behind a slice: a thousandth of the room that they take."""
-        assert "one slice only" in refused(
-            archive(tmp_path / "a.zip", {"b.dcm": slice_bytes + bytes(200 * MIB)})
-        )
+    def test_archive_in_an_archive(self, tmp_path, refused, slice_bytes):
+        archive(tmp_path / "in.zip", {"b.dcm": slice_bytes})
+        outer = archive(tmp_path / "a.zip", {"in.zip": (tmp_path / "in.zip").read_bytes()})
+        assert "unknown kind of file" in refused(outer)
 
-    def test_entry_larger_than_declared(self, tmp_path, refused, slice_bytes):
-        bomb = archive(tmp_path / "a.zip", {"b.dcm": slice_bytes + bytes(50 * MIB)})
-        assert "b.dcm" in refused(declared(bomb, size=len(slice_bytes)))
+    def test_entry_without_a_name(self, tmp_path, refused, slice_bytes):
+        path = archive(tmp_path / "a.zip", {"Zb.dcm": slice_bytes})
+        path.write_bytes(path.read_bytes().replace(b"Zb.dcm", b"\0b.dcm"))
+        refused(path)
 
     def test_many_entries(self, tmp_path, refused, monkeypatch):
         monkeypatch.setattr(dicom_files, "MOST_FILES", 20)
@@ -350,22 +371,6 @@ class TestArchives:
         monkeypatch.setattr(dicom_files, "MOST_ARCHIVE_BYTES", 2 * len(slice_bytes))
         many = archive(tmp_path / "a.zip", {f"{n}.dcm": slice_bytes for n in range(3)})
         assert "GiB of DICOM; expected at most" in refused(many)
-
-    def test_archive_in_an_archive(self, tmp_path, refused, slice_bytes):
-        archive(tmp_path / "in.zip", {"b.dcm": slice_bytes})
-        outer = archive(tmp_path / "a.zip", {"in.zip": (tmp_path / "in.zip").read_bytes()})
-        assert "unknown kind of file" in refused(outer)
-
-    def test_encrypted(self, tmp_path, refused, slice_bytes):
-        assert "encrypted" in refused(declared(archive(tmp_path / "a.zip", {"b.dcm": slice_bytes}), flags=1))
-
-    def test_entry_without_a_name(self, tmp_path, refused, slice_bytes):
-        path = archive(tmp_path / "a.zip", {"Zb.dcm": slice_bytes})
-        path.write_bytes(path.read_bytes().replace(b"Zb.dcm", b"\0b.dcm"))
-        refused(path)
-
-    def test_line_in_a_name(self, tmp_path, refused, slice_bytes):
-        refused(declared(archive(tmp_path / "a.zip", {"b\nc.dcm": slice_bytes}), flags=1), name="a.zip")
 
     @pytest.mark.parametrize("share", [0.3, 0.7, 0.99])
     def test_cut_off(self, tmp_path, refused, share):

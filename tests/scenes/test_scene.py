@@ -12,7 +12,6 @@ from errors import PatientError
 from rehearsal.build_solver import step_settings
 from rehearsal.configuration import probe_of
 from scenes.anatomy import load_anatomy, press_on
-from scenes.phantom.embedded_patient import phantom_folder
 from scenes.scene import (
     EMBEDDED,
     AnatomyFiles,
@@ -242,15 +241,6 @@ def test_a_press_left_open_goes_with_gravity_through_the_tumour(tmp_path):
     given = Press(target_mm=(1, 2, 3), direction=(0, 0, -2), lateral=(1, 0, 0))
     kept = press_on(given, anatomy, np.array([0.0, 1.0, 0.0]))
     assert kept.target_mm == (1, 2, 3) and kept.direction == (0, 0, -1) and kept.lateral == (1, 0, 0)
-
-
-def test_the_embedded_patient_is_made_once():
-    folder = phantom_folder()
-    stamp = (folder / "ct.nrrd").stat().st_mtime_ns
-    assert phantom_folder() == folder and (folder / "ct.nrrd").stat().st_mtime_ns == stamp
-    anatomy = load_anatomy(load_scene(EMBEDDED), EMBEDDED.parent)
-    assert 150e3 < anatomy.organ.volume < 200e3
-    assert anatomy.tumour is not None and len(anatomy.shapes) == 1
 
 
 @pytest.mark.parametrize(

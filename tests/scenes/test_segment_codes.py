@@ -10,6 +10,7 @@ import pytest
 import SimpleITK as sitk
 from dicom_series import Series, refusal, write_segmentation
 from pydicom.dataset import Dataset
+from raw_nrrd import with_segments
 from synthetic_body import LEFT, TUMOUR, body
 
 from scenes.patients.import_warnings import _place, label_warnings
@@ -110,11 +111,8 @@ def slicer_file(path, *segments):
     """A .seg.nrrd of segments (name, codes) that are rows of voxels, each 3 x 4 of them."""
     voxels = np.zeros((3, 4, len(segments) + 2), np.uint8)
     image = sitk.GetImageFromArray(voxels + np.arange(len(segments) + 2, dtype=np.uint8))
-    for n, (name, codes) in enumerate(segments):
-        image.SetMetaData(f"Segment{n}_Name", name)
-        image.SetMetaData(f"Segment{n}_LabelValue", str(n + 1))
-        image.SetMetaData(f"Segment{n}_Tags", tags(*codes))
-    sitk.WriteImage(image, str(path))
+    fields = [dict(Name=name, LabelValue=n, Tags=tags(*codes)) for n, (name, codes) in enumerate(segments, 1)]
+    sitk.WriteImage(with_segments(image, fields), str(path))
     return path
 
 
