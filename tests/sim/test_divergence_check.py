@@ -244,36 +244,32 @@ def field_of(values) -> Field:
     return field
 
 
-def share_of(shapes: list, start, way, free: float) -> float:
+def wall() -> Plane:
+    return Plane(np.array([-1.0, 0.0, 0.0]), -30.0)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "start", "way", "share"),
+    [
+        # From 52 mm above the floor, 200 mm down: 52 mm and the impact depth.
+        ([floor, tool], [0, 0, 40.0], [0, 0, -200.0], (52 + IMPACT_DEPTH_MM) / 200),
+        ([floor, tool], [0, 0, 40.0], [0, 0, 200.0], 1.0),
+        ([floor, tool], [0, 0, -12.0], [20.0, 0, 0], 1.0),
+        ([floor, tool], [0, 0, -20.0], [0, 0, -2.9], 1.0),
+        # A point deep inside moves no farther than the free length.
+        ([floor, tool], [0, 0, -20.0], [0, 0, -30.0], 0.1),
+        # Moving shapes are ignored.
+        ([tool], [0, 0, 40.0], [0, 0, -200.0], 1.0),
+        ([floor, wall], [0, 0, 40.0], [0, 0, -200.0], (52 + IMPACT_DEPTH_MM) / 200),
+        ([wall, floor], [0, 0, 40.0], [0, 0, -200.0], (52 + IMPACT_DEPTH_MM) / 200),
+        ([floor, wall], [0, 0, 40.0], [200.0, 0, 0], (30 + IMPACT_DEPTH_MM) / 200),
+        ([wall, floor], [0, 0, 40.0], [200.0, 0, 0], (30 + IMPACT_DEPTH_MM) / 200),
+    ],
+)
+def test_a_path_ends_at_the_time_of_impact_with_the_first_shape(one_device, shapes, start, way, share):
     out = zeros(1)
-    fractions(TimeOfImpact(shapes), field_of(start), field_of(way), free, out)
-    return float(array_of(out)[0])
-
-
-def test_a_path_ends_at_the_time_of_impact(one_device):
-    shapes = [floor(), ConvexTool.cuboid(np.array([10.0, 6.0, 10.0]))]
-    # From 52 mm above the floor, 200 mm down: 52 mm and the impact depth.
-    assert share_of(shapes, [0, 0, 40.0], [0, 0, -200.0], 3.0) == pytest.approx(
-        (52 + IMPACT_DEPTH_MM) / 200, abs=1e-3
-    )
-    assert share_of(shapes, [0, 0, 40.0], [0, 0, 200.0], 3.0) == 1.0
-    assert share_of(shapes, [0, 0, -12.0], [20.0, 0, 0], 3.0) == 1.0
-    assert share_of(shapes, [0, 0, -20.0], [0, 0, -2.9], 3.0) == 1.0
-    # A point deep inside moves no farther than the free length.
-    assert share_of(shapes, [0, 0, -20.0], [0, 0, -30.0], 3.0) == pytest.approx(0.1)
-    # Moving shapes are ignored.
-    assert share_of(shapes[1:], [0, 0, 40.0], [0, 0, -200.0], 3.0) == 1.0
-
-
-def test_a_path_ends_at_the_first_of_several_shapes(one_device):
-    wall = Plane(np.array([-1.0, 0.0, 0.0]), -30.0)
-    for shapes in ([floor(), wall], [wall, floor()]):
-        assert share_of(shapes, [0, 0, 40.0], [0, 0, -200.0], 3.0) == pytest.approx(
-            (52 + IMPACT_DEPTH_MM) / 200, abs=1e-3
-        )
-        assert share_of(shapes, [0, 0, 40.0], [200.0, 0, 0], 3.0) == pytest.approx(
-            (30 + IMPACT_DEPTH_MM) / 200, abs=1e-3
-        )
+    fractions(TimeOfImpact([shape() for shape in shapes]), field_of(start), field_of(way), 3.0, out)
+    assert array_of(out)[0] == pytest.approx(share, abs=1e-6 if share in (0.1, 1.0) else 1e-3)
 
 
 def test_clearance_is_not_more_than_the_distance(one_device, ball):

@@ -35,12 +35,11 @@ def deformed(particles: np.ndarray) -> np.ndarray:
     return 1.1 * bent @ rotation_about([1, 2, 3], 70).T + [5.0, -3.0, 8.0]
 
 
-def oracle(model: ShapeMatching, x: np.ndarray, step: float, mass: np.ndarray | None = None) -> np.ndarray:
+def oracle(model: ShapeMatching, x: np.ndarray, step: float, mass: np.ndarray | float = 1.0) -> np.ndarray:
     """One iteration of Eqs. 8, 9, 12 and 7 in float64, cluster by cluster, for particles of a mass (n,)."""
     rest, patches = model.body.rest_points, model.patches
     shared = patches.cluster_counts[patches.of_particles()].astype(float)
-    weight = 1 / shared if model.relaxation == "local" else np.ones(len(rest))
-    weight = weight if mass is None else weight * mass
+    weight = mass / shared if model.relaxation == "local" else mass * np.ones(len(rest))
     of_patch = np.repeat(np.arange(len(patches)), patches.cluster_counts)
     total = np.zeros_like(x)
     for c in range(model.count):
@@ -66,11 +65,17 @@ def moved_body(
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
-@pytest.mark.parametrize("stiffness, factor", [(1.0, 1.0), (0.4, 1.0), (0.9, 1.7)])
-def test_an_iteration_matches_the_oracle(kept, block, relaxation, stiffness, factor):
-    body, model, x = moved_body(kept, block, relaxation)
+@pytest.mark.parametrize(
+    "stiffness, factor, scaling", [(1.0, 1.0, 0.0), (0.4, 1.0, 0.0), (0.9, 1.7, 0.0), (1.0, 1.0, 0.1)]
+)
+def test_an_iteration_matches_the_oracle(kept, block, relaxation, stiffness, factor, scaling):
+    body, model, x = moved_body(kept, block, relaxation, scaling)
+    mass = np.exp(-scaling * body.rest_points[:, 2])
+    if scaling:
+        fill((body.mass_scale, mass))
+        assert np.abs(oracle(model, x, 1.0, mass) - oracle(model, x, 1.0)).max() > 100 * ROUNDING_MM
     project(model, stiffness, factor)
-    wanted = oracle(model, x, stiffness * factor)
+    wanted = oracle(model, x, stiffness * factor, mass)
     assert np.abs(wanted - x).max() > 0.3
     assert np.abs(array_of(body.predicted) - wanted).max() < ROUNDING_MM
 
@@ -87,15 +92,6 @@ def test_an_iteration_conserves_linear_and_angular_momentum(kept, block, relaxat
     assert np.abs(change.sum(axis=0)).max() < ROUNDING_MM * n**0.5 * 3
     turning = np.cross(x - x.mean(axis=0), change).sum(axis=0)
     assert np.abs(turning).max() < ROUNDING_MM * n**0.5 * 3 * np.abs(x - x.mean(axis=0)).max()
-
-
-def test_a_rigid_motion_is_no_deformation(kept, block):
-    body, model, _ = moved_body(kept, block, "local")
-    turned = body.rest_points @ rotation_about([0, 1, 1], 130).T + [100.0, 20.0, -50.0]
-    fill((body.predicted, turned))
-    project(model, 1.0, 1.0)
-    # At 100 mm float32 carries 1e-5 mm.
-    assert np.abs(array_of(body.predicted) - turned).max() < 10 * ROUNDING_MM
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
@@ -160,17 +156,6 @@ def test_collapsed_flat_and_inverted_bodies_come_back_to_finite_shapes(kept, blo
         assert np.isfinite(array_of(body.predicted)).all()
         turned = array_of(model.frame)[:, :3, :3].astype(float)
         assert np.abs(np.linalg.det(turned) - 1).max() < 1e-5
-
-
-@pytest.mark.parametrize("relaxation", ["local", "global"])
-def test_scaled_masses_move_the_clusters_towards_the_heavier(kept, block, relaxation):
-    body, model, x = moved_body(kept, block, relaxation, mass_scaling=0.1)
-    mass = np.exp(-0.1 * body.rest_points[:, 2]).astype(np.float32)
-    fill((body.mass_scale, mass))
-    project(model, 1.0, 1.0)
-    wanted = oracle(model, x, 1.0, mass.astype(float))
-    assert np.abs(wanted - oracle(model, x, 1.0)).max() > 100 * ROUNDING_MM
-    assert np.abs(array_of(body.predicted) - wanted).max() < ROUNDING_MM
 
 
 def test_frames_do_not_depend_on_those_before(kept, block):

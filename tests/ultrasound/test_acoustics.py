@@ -4,6 +4,7 @@ what HU vary within a tissue.
 
 import numpy as np
 import pytest
+import trimesh
 from conftest import rotation_about
 
 from sim import stored_arrays
@@ -26,6 +27,7 @@ from ultrasound.acoustics import (
     stored_properties,
     tissue_table,
 )
+from ultrasound.scanned_anatomy import ScannedAnatomy
 
 TISSUES = [name for name in tissue_table() if name != "hounsfield"]
 # Of contrast agent in the corticomedullary phase, far above what density makes of it.
@@ -186,6 +188,8 @@ def test_voxels_have_their_spacing_along_their_own_axes():
     mm_from_index[:3, :3] = turn * spacing
     voxels = TissueVoxels(np.zeros(SHAPE), None, {}, np.linalg.inv(mm_from_index))
     assert voxels.spacing_mm == pytest.approx(spacing)
+    anatomy = ScannedAnatomy(trimesh.Trimesh(), np.zeros(SHAPE), np.linalg.inv(mm_from_index))
+    assert anatomy.voxel_mm == pytest.approx(spacing)
 
 
 def test_the_same_voxels_have_the_same_properties():

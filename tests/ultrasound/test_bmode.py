@@ -1,7 +1,5 @@
 """The echo against closed forms: what tissue takes, reflects and scatters, and how wide a point is drawn."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 import trimesh
@@ -547,39 +545,6 @@ def test_speckle_decorrelates_across_the_plane_as_the_beam_does(endless, axis, t
     wanted = np.exp(-0.5 * (steps[:, None] / sd) ** 2)
     assert np.abs(curves - wanted)[:, 1:].max() < 0.16
     assert np.abs(curves - wanted)[:, 1:].mean(axis=1).max() < 0.07
-
-
-def test_the_decorrelation_of_a_sweep_gives_its_elevational_steps(endless):
-    """Sensorless freehand: the curve is calibrated on one sweep, the steps are those of another,
-    elsewhere.
-    """
-    probe = probe_of(depth_mm=40.0, element_height_mm=4.0)
-    endless.fill(backscatter=0.1)
-
-    def correlation(origin, step_mm, frames=10):
-        seen = []
-        for k in range(frames):
-            place = np.add(origin, [0, 0, k * step_mm])
-            seen.append(10 ** (endless.look(probe, "speckle", place)[:, 160:480] / 20))
-        seen = [each - each.mean() for each in seen]
-        pairs = pairwise(seen)
-        return np.mean([(a * b).mean() / np.sqrt((a**2).mean() * (b**2).mean()) for a, b in pairs])
-
-    known = np.linspace(0.0, 0.8, 9)
-    curve = [correlation((13.0, -22.0, 5.0), each) for each in known]
-    for step in (0.1, 0.2, 0.35, 0.5):
-        found = np.interp(-correlation((-31.0, 8.0, -17.0), step), -np.array(curve), known)
-        assert found == pytest.approx(step, rel=0.15)
-
-
-@pytest.mark.parametrize("detail_level", RUNGS)
-def test_the_same_pose_gives_the_same_bits_again(fine, detail_level):
-    probe = probe_of()
-    fine.fill(interface(FAT, TISSUE, 0.4, 20.0), 0.5, 0.1)
-    first, picture = fine.look(probe, detail_level), fine.picture
-    assert (fine.look(probe, detail_level) == first).all()
-    assert np.abs(fine.look(probe_of(frequency_mhz=5.0), detail_level, (2.0, 1.0, 3.0)) - first).max() > 1.0
-    assert (fine.look(probe, detail_level) == first).all() and (fine.picture == picture).all()
 
 
 @pytest.fixture(scope="module")

@@ -175,12 +175,6 @@ def test_under_an_affine_deformation_it_is_the_pull_back_within_the_skins_error(
     assert error.mean() < 0.35 * undeformed.mean()
 
 
-def test_the_picture_is_the_window(kept, ball):
-    cut, _, _, _ = sliced(kept, ball, noisy_image)
-    wanted = np.clip((hounsfield(cut).astype(float) - 40) / 350 + 0.5, 0, 1) * 255
-    assert np.abs(cut.render(350.0, 40.0) - wanted).max() <= 0.51
-
-
 def bent(x: np.ndarray) -> np.ndarray:
     return x + 0.03 * x[:, [1, 2, 0]] ** 2
 

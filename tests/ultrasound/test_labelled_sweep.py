@@ -29,7 +29,7 @@ from sim.signed_distance import signed_distance
 from studies.freehand.freehand_sweeps import sweep_of
 from ultrasound import reconstruction
 from ultrasound.probe import load_probe
-from ultrasound.probe_manipulator import image_plane, pose_at, pose_of_image_plane
+from ultrasound.probe_manipulator import pose_at
 from ultrasound.sweep import PixelLabel, Sweep, SweepError
 from ultrasound.sweep_file import (
     LABELS_SUFFIX,
@@ -236,13 +236,6 @@ def test_the_matrices_of_a_frame_are_of_its_rows_and_columns(tmp_path):
         assert read.images.shape == (1, 50, 80)
         assert np.array_equal(read.transform("Image", "Probe", 0), probe.image_to_probe(50, 80))
         assert np.array_equal(read.transform("Probe", "Reference", 0), pose)
-
-
-def test_a_probe_is_held_where_its_image_plane_is():
-    pose = pose_at(np.array([9.0, -4, 17]), np.array([0.3, -0.2, -1]), np.array([1, 0.5, 0.2]), 30.0)
-    assert pose_of_image_plane(image_plane(pose, 22.0, 40, 50, 6).world_from_plane, 22.0) == pytest.approx(
-        pose
-    )
 
 
 def still_rehearsal() -> tuple[SimpleNamespace, list[np.ndarray]]:

@@ -152,27 +152,24 @@ def test_lines_leave_the_face_at_the_middles_of_equal_shares(geometry):
     assert probe.elements() == pytest.approx(elements, abs=1e-12)
 
 
-@pytest.mark.parametrize("geometry, steering", [*((each, 0.0) for each in GEOMETRIES), ("LINEAR", -20.0)])
+@pytest.mark.parametrize(
+    "geometry, steering", [*((name, 0.0) for name in GEOMETRIES), ("LINEAR", -20.0), ("CURVILINEAR", 12.0)]
+)
 def test_beam_coordinates_invert_the_scanlines(geometry, steering):
     probe = probe_of(geometry, steering_deg=steering)
     start, direction = probe.scanlines()
+    turned = np.arctan2(*direction.T) - np.arctan2(*probe_of(geometry).scanlines()[1].T)
+    assert np.degrees(turned) == pytest.approx(steering, abs=1e-6)
     lines, along = np.meshgrid(np.arange(LINES), [1.0, 17.3, 40.0, 79.9], indexing="ij")
     place = start[lines] + along[..., None] * direction[lines]
     line, depth = probe.beam_coordinates(place[..., 0], place[..., 1])
-    assert line == pytest.approx(lines, abs=1e-9) and depth == pytest.approx(along, abs=1e-9)
+    # Steered lines of a curved array are found by iteration.
+    assert line == pytest.approx(lines, abs=1e-6) and depth == pytest.approx(along, abs=1e-6)
+    if geometry == "CURVILINEAR" and steering:
+        return  # Their distance is that along the face.
     # Neighbouring lines are as far apart as is said: the chord is 1 - step^2 / 24 of the arc.
     apart = np.linalg.norm(np.diff(place, axis=0), axis=-1)
     assert apart == pytest.approx(np.tile(probe.line_spacing_mm(along[0]), (LINES - 1, 1)), rel=1e-5)
-
-
-def test_beam_coordinates_invert_steered_scanlines_of_a_curved_array():
-    probe = probe_of("CURVILINEAR", steering_deg=12.0)
-    start, direction = probe.scanlines()
-    assert np.degrees(np.arctan2(*direction[96])) == pytest.approx(12.0 + -2.5 + 45 / 384, abs=1e-6)
-    place = start[:, None] + np.array([1.0, 40.0, 79.0])[:, None] * direction[:, None]
-    line, depth = probe.beam_coordinates(place[..., 0], place[..., 1])
-    assert line == pytest.approx(np.repeat(np.arange(LINES)[:, None], 3, axis=1), abs=1e-6)
-    assert depth == pytest.approx(np.tile([1.0, 40.0, 79.0], (LINES, 1)), abs=1e-6)
 
 
 def test_angles_of_compounding_are_around_that_of_the_probe_which_is_the_first():

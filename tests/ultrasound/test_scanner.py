@@ -12,7 +12,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from conftest import rotation_about
 from slicing import hounsfield
 
 from sim.embedding import Unmoved
@@ -70,11 +69,6 @@ def echo(scanner: Scanner, plane: ImagePlane) -> np.ndarray:
     """What the middle line holds [dB], but for the gain."""
     scanner.images(plane, PROBE, "b-mode", "reflection", 350.0, 40.0)
     return array_of(scanner.bmode.decibel)[16].astype(float) - PROBE.gain_db()
-
-
-@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.8, 1.25, 2.0), (2.0, 0.8, 1.25)])
-def test_voxels_are_measured_along_their_own_axes(spacing):
-    assert anatomy(spacing, rotation_about([1, 2, 3], 40)).voxel_mm == pytest.approx(spacing)
 
 
 def test_the_slice_is_windowed_as_asked_for(usual):

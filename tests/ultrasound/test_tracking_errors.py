@@ -53,13 +53,6 @@ def test_noise_has_the_deviation_asked_for_on_every_axis_and_no_two_axes_or_fram
     assert np.abs((drawn[1:] * drawn[:-1]).mean(axis=0)).max() < SIGMAS / np.sqrt(FRAMES)
 
 
-def test_noise_turns_the_probe_about_its_own_origin():
-    poses, _ = sweep()
-    found = reported(TrackingErrors(noise_deg=3.0))
-    np.testing.assert_array_equal(found[:, :3, 3], poses[:, :3, 3])
-    assert np.linalg.norm(turns_deg(found, poses), axis=1).min() > 0
-
-
 def test_noise_turns_about_the_probes_own_axes_whatever_its_pose():
     poses, times = sweep(50)
     upright = np.tile(np.eye(4), (50, 1, 1))
@@ -120,18 +113,14 @@ def test_a_single_pose_has_nothing_earlier():
     )
 
 
-@pytest.mark.parametrize("lost", [0.03, 0.4])
+@pytest.mark.parametrize("lost", [0.03, 0.4, 1.0])
 def test_the_share_of_lost_frames_is_that_asked_for(lost):
     poses, times = sweep()
     gone = np.array([pose is None for pose in with_tracking_errors(poses, times, TrackingErrors(lost=lost))])
     # The standard error of a share of n independent frames.
-    assert abs(gone.mean() - lost) < SIGMAS * np.sqrt(lost * (1 - lost) / FRAMES)
+    assert abs(gone.mean() - lost) <= SIGMAS * np.sqrt(lost * (1 - lost) / FRAMES)
     # In a row as often as chance has it, whose standard error is at most that of so many pairs.
     assert abs((gone[1:] & gone[:-1]).mean() - lost**2) < 2 * SIGMAS * lost / np.sqrt(FRAMES)
-
-
-def test_all_frames_can_be_lost():
-    assert with_tracking_errors(*sweep(50), TrackingErrors(lost=1.0)) == [None] * 50
 
 
 def test_what_is_reported_is_rigid():
