@@ -42,7 +42,7 @@ def test_voxels_are_centred_in_the_surfaces_bounds(ball):
 
 def test_surface_samples_are_as_many_as_asked_for(ball):
     # So few that none is within the radius of another.
-    particles = fill_body(ball, 0.5, 1, surface_samples_per_mm2=0.01).particles
+    particles = fill_body(ball, 0.7, 1, surface_samples_per_mm2=0.01).particles
     on = np.abs(igl.signed_distance(particles, ball.vertices, ball.faces)[0]) < 1e-6
     assert on.sum() == int(0.01 * ball.area) == 18
 
@@ -71,19 +71,6 @@ def test_clusters_cover_and_overlap(ball):
         assert (np.diff(row) > 0).all()
         members = particles[row]
         assert cKDTree(members).query_ball_point(members, spacing, return_length=True).max() == len(members)
-
-
-def test_transposed_clusters_have_the_same_memberships(ball):
-    particles = fill_body(ball, 2.0, 4).particles
-    clusters = sample_clusters(particles, 6.0)
-    seen = clusters.T.tocsr()
-    pairs = {
-        (c, i)
-        for c in range(clusters.shape[0])
-        for i in clusters.indices[clusters.indptr[c] : clusters.indptr[c + 1]]
-    }
-    back = {(c, i) for i in range(len(particles)) for c in seen.indices[seen.indptr[i] : seen.indptr[i + 1]]}
-    assert pairs == back
 
 
 def test_a_body_touches_where_its_surface_does(ball):

@@ -164,8 +164,8 @@ def bowl() -> SignedDistanceField:
     return SignedDistanceField(distance, np.full(3, -20.0), np.ones(3))
 
 
-@pytest.mark.parametrize("iterations", [1, 2, 9, 10])
-@pytest.mark.parametrize("factor", [1.0, 1.5, 2.0])
+@pytest.mark.parametrize("iterations", [1, 2, 10])
+@pytest.mark.parametrize("factor", [1.5, 2.0])
 def test_over_relaxation_is_stable(kept, ball, iterations, factor):
     solver = kept(on_floor, ball, -12.0)
     settings = StepSettings(stiffness=1.0, iterations=iterations, relaxation_factor=factor, damping=0.0)

@@ -256,9 +256,9 @@ def on_the_arc(towards: np.ndarray, way_mm: float) -> np.ndarray:
     return RADIUS * (np.sin(angle) * np.asarray(towards, float) + np.cos(angle) * np.array([0, 0, 1.0]))
 
 
-# A step d along the tangent becomes R atan(d / R), 0.04 % less for 1 mm; the sphere's edges are 2.2 mm long, so
-# that its faces lie up to 2.2^2 / (8 R) = 0.02 mm under it, and their smoothed normals rock a step by no more
-# than that over an edge.
+# A step d along the tangent becomes R atan(d / R), 0.04 % less for 1 mm; the sphere's edges are 2.2 mm long,
+# so that its faces lie up to 2.2^2 / (8 R) = 0.02 mm under it, and their smoothed normals rock a step by no
+# more than that over an edge.
 @pytest.mark.parametrize(
     ("lateral", "elevation", "turned", "towards"),
     [
