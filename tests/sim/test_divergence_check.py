@@ -20,7 +20,7 @@ from sim.divergence_check import (
     DivergenceCheck,
     tetrahedra_among,
 )
-from sim.fields import Field, array_of, fill, zeros
+from sim.fields import array_of, field_of, zeros
 from sim.kernels import kernel
 from sim.shapes import (
     GRID_MM,
@@ -202,16 +202,6 @@ def test_how_long_ago_a_restored_state_was_is_the_sum_of_the_steps_whatever_thei
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_torn_points_stay_finite(kept, ball, model):
-    solver = on_floor(kept, model, ball)
-    for mm in (100.0, 1000.0):
-        put(solver, solver.body.rest_points + np.random.default_rng(0).normal(0, mm, (solver.body.count, 3)))
-        for _ in range(5):
-            solver.step(settings(model))
-        assert np.isfinite(position(solver)).all(), mm
-
-
-@pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("velocity", [(0, 0, -1e4), (1e3, 0, -1e6)])
 def test_fast_bodies_do_not_pass_through_a_floor(kept, ball, model, velocity):
     # For a block 30 mm thick and for a half-space, from 100 mm above.
@@ -235,13 +225,6 @@ def fractions(
 def clearances(shape: ti.template(), at: ti.template(), out: ti.template()):
     for i in range(at.shape[0]):
         out[i] = shape.clearance(at[i])
-
-
-def field_of(values) -> Field:
-    values = np.atleast_2d(np.asarray(values, np.float32))
-    field = zeros(len(values), 3, within=1)
-    fill((field, values))
-    return field
 
 
 def wall() -> Plane:
@@ -268,7 +251,7 @@ def wall() -> Plane:
 )
 def test_a_path_ends_at_the_time_of_impact_with_the_first_shape(one_device, shapes, start, way, share):
     out = zeros(1)
-    fractions(TimeOfImpact([shape() for shape in shapes]), field_of(start), field_of(way), 3.0, out)
+    fractions(TimeOfImpact([shape() for shape in shapes]), field_of([start], 1), field_of([way], 1), 3.0, out)
     assert array_of(out)[0] == pytest.approx(share, abs=1e-6 if share in (0.1, 1.0) else 1e-3)
 
 
@@ -276,7 +259,7 @@ def test_clearance_is_not_more_than_the_distance(one_device, ball):
     shape = SignedDistanceField.of_surface(ball.vertices, ball.faces, 4.0)
     points = np.random.default_rng(1).uniform(-40, 40, (2000, 3))
     out = zeros(len(points))
-    clearances(shape, field_of(points), out)
+    clearances(shape, field_of(points, 1), out)
     true = np.linalg.norm(points, axis=1) - 12.0
     # Linear interpolation: an error of less than half the diagonal of a cell; outside the grid of half a cell
     # at most.
@@ -292,7 +275,7 @@ def test_clearance_outside_a_grid_is_the_distance_to_it(one_device):
     points = np.random.default_rng(2).uniform(-40, 40, (2000, 3))
     points = points[(np.abs(points) > 16.0).any(axis=1)]
     out = zeros(len(points))
-    clearances(shape, field_of(points), out)
+    clearances(shape, field_of(points, 1), out)
     way = np.linalg.norm(points - np.clip(points, -16.0, 16.0), axis=1)
     # And a little more, so that paths end in the grid.
     assert array_of(out) == pytest.approx(way + OUTSIDE_GRID_CELLS * 0.5, abs=1e-4)

@@ -4,7 +4,6 @@ import igl
 import numpy as np
 import pytest
 import trimesh
-from conftest import rotation_about
 
 from sim.lattice import (
     CORNERS,
@@ -60,13 +59,6 @@ def test_tissue_has_the_surfaces_volume_and_centre(mesh, cell_mm):
     # Bound of the centre: all missing volume on one side, at half of the size.
     reach = mesh.extents.max() / 2
     assert np.abs(centre - mesh.center_mass).max() < bound / mesh.volume * reach / 4
-
-
-def test_cells_too_large_for_the_organ_are_refused(ball):
-    with pytest.raises(SamplingError, match="choose smaller ones"):
-        fill_with_cells(trimesh.creation.box([30.0, 30.0, 0.5]), 5.0)
-    with pytest.raises(SamplingError, match="fill 0 % of"):
-        fill_with_cells(trimesh.creation.icosphere(subdivisions=2, radius=0.5), 20.0)
 
 
 def test_empty_space_in_cut_cells_has_little_stiffness(mesh):
@@ -212,26 +204,15 @@ def test_pressure_at_the_surface_points_has_the_resultant_of_the_surface(ball):
     assert -(area * normal[:, 2])[below].sum() == pytest.approx(disc, rel=0.03)
 
 
-def test_too_many_cells_are_refused(ball):
-    with pytest.raises(SamplingError, match="choose larger ones"):
-        fill_with_cells(ball, 0.2)
-    with pytest.raises(SamplingError):
-        fill_with_cells(trimesh.creation.box([1000.0, 1000.0, 1000.0]), 0.5)
-
-
-def test_the_same_surface_gives_the_same_lattice(ball):
-    first, second = fill_with_cells(ball, 4.0), fill_with_cells(ball, 4.0)
-    for name in ("nodes", "cells", "gradient", "volume", "hourglass", "tissue"):
-        assert (getattr(first, name) == getattr(second, name)).all()
-
-
-def test_a_rotated_body_gives_the_rotated_lattice(block):
-    # After a quarter turn the cells coincide, because all edges are multiples of a cell.
-    turned = block.copy()
-    turn = np.eye(4)
-    turn[:3, :3] = np.round(rotation_about([0, 0, 1], 90))
-    turned.apply_transform(turn)
-    a, b = fill_with_cells(block, 4.0), fill_with_cells(turned, 4.0)
-    assert len(a.cells) == len(b.cells)
-    assert np.abs(np.sort(a.volume) - np.sort(b.volume)).max() < 1e-9
-    assert np.abs(np.sort(a.tissue, axis=None) - np.sort(b.tissue, axis=None)).max() < 1e-9
+@pytest.mark.parametrize(
+    ("extents", "cell_mm", "words"),
+    [
+        ((30.0, 30.0, 0.5), 5.0, "choose smaller ones"),
+        ((0.8, 0.8, 0.8), 20.0, "fill 0 % of"),
+        ((24.0, 24.0, 24.0), 0.2, "choose larger ones"),
+        ((1000.0, 1000.0, 1000.0), 0.5, "choose larger ones"),
+    ],
+)
+def test_cells_too_large_or_too_many_are_refused(extents, cell_mm, words):
+    with pytest.raises(SamplingError, match=words):
+        fill_with_cells(trimesh.creation.box(extents), cell_mm)

@@ -54,12 +54,6 @@ def test_surface_samples_put_particles_on_the_surface(ball):
     assert cKDTree(particles).query(particles, 2)[0][:, 1].min() >= 2.0 - 1e-9
 
 
-def test_same_surface_same_particles(ball):
-    a = fill_body(ball, 2.0, 4, surface_samples_per_mm2=1.0).particles
-    b = fill_body(ball, 2.0, 4, surface_samples_per_mm2=1.0).particles
-    assert np.array_equal(a, b)
-
-
 def test_clusters_cover_and_overlap(ball):
     particles = fill_body(ball, 1.5, 4).particles
     spacing = 3.33 * 1.5

@@ -242,6 +242,7 @@ ABUSES = {
     "inside out": lambda rest: rest * [1, 1, -1],
     "blown up": lambda rest: 50.0 * rest,
     "scrambled": lambda rest: np.random.default_rng(1).permutation(rest),
+    "torn": lambda rest: rest + np.random.default_rng(0).normal(0, 1000.0, rest.shape),
 }
 
 

@@ -2,17 +2,14 @@
 
 import numpy as np
 import pytest
-import trimesh
 from conftest import rotation_about
-from particle_tissue import tissue_of
+from particle_tissue import carried_along
 from pulse_oracle import fwhm_mm, loss_db
 from scipy import special, stats
 from scipy.spatial.transform import Rotation
 from skimage.registration import phase_cross_correlation
 
-from sim.body import BodyState
-from sim.device import start
-from sim.embedding import Embedding, Unmoved
+from sim.embedding import Unmoved
 from sim.fields import array_of, fill
 from ultrasound.beam import elevation_profiles, lateral_profiles
 from ultrasound.bmode import MAX_HALF_WIDTH, BMode
@@ -106,23 +103,18 @@ def flat_tank(voxel: float, **settings) -> Tank:
     return Tank((voxel, voxel, BOUNDLESS), count, (voxel / 2 - 50, -15.0, 0.0), **settings)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def taichi():
-    start("cpu")
-
-
 @pytest.fixture(scope="module")
-def fine(taichi) -> Tank:
+def fine(one_device) -> Tank:
     return flat_tank(0.5)
 
 
 @pytest.fixture(scope="module")
-def coarse(taichi) -> Tank:
+def coarse(one_device) -> Tank:
     return flat_tank(0.9)
 
 
 @pytest.fixture(scope="module")
-def endless(taichi) -> Tank:
+def endless(one_device) -> Tank:
     return Tank((BOUNDLESS,) * 3, (1, 1, 1), (0.0, 0.0, 0.0))
 
 
@@ -431,7 +423,7 @@ def test_a_stones_shadow_has_the_penumbra_of_the_aperture(fine):
         assert np.abs(amplitude - share)[inner].mean() < 0.04
 
 
-def test_beyond_the_ct_nothing_reflects():
+def test_beyond_the_ct_nothing_reflects(one_device):
     tank = Tank((BOUNDLESS, 0.5, BOUNDLESS), (1, 40, 1), (0, 0.25, 0), contact="organ")
     tank.fill(backscatter=0.1)
     for beyond in (0.3, 2.0):
@@ -548,18 +540,9 @@ def test_speckle_decorrelates_across_the_plane_as_the_beam_does(endless, axis, t
 
 
 @pytest.fixture(scope="module")
-def moved(taichi):
+def moved(one_device):
     """A tank whose tissue a ball of 12 mm carries along, and what moves it: x -> matrix @ x + shift."""
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=12.0)
-    model = tissue_of(ball)
-    embedding = Embedding(model.carrier, ball, 4.0)
-
-    def move(matrix, shift) -> None:
-        x = (model.body.rest_points @ np.transpose(matrix) + shift).astype(np.float32)
-        model.body.restore(BodyState(x, np.zeros_like(x)))
-        model.update_frames()
-        embedding.update()
-
+    embedding, move = carried_along()
     return flat_tank(0.5, embedding=embedding), move
 
 
@@ -603,7 +586,7 @@ def test_tracked_speckle_moves_as_the_tissue_does(moved, across, along, shear):
     assert errors.mean() < 0.05 and errors.max() < 0.2 < ways.mean()
 
 
-def test_a_target_off_the_plane_is_dimmed_as_the_thick_plane_weighs_it():
+def test_a_target_off_the_plane_is_dimmed_as_the_thick_plane_weighs_it(one_device):
     # The element is so low that the beam is as thick at every depth as at its focus, nearly; the SD is
     # checked in test_beam_profiles.
     probe = probe_of(element_height_mm=1.5, elevation_focus_mm=40.0)
@@ -664,7 +647,7 @@ def test_each_ray_is_turned_by_the_interfaces_on_its_own_path(fine):
     assert np.abs(turn).max() > 0.01
 
 
-def test_half_of_a_slice_beyond_the_ct_has_the_impedance_of_the_other_half():
+def test_half_of_a_slice_beyond_the_ct_has_the_impedance_of_the_other_half(one_device):
     """The CT ends 0.6 mm beside the image plane, within the slice."""
     tank = Tank((1.0, 1.0, 1.0), (60, 100, 12), (-30.0, -10.0, -11.1))
     tank.fill(USUAL, 0.0, 0.1)
@@ -675,7 +658,7 @@ def test_half_of_a_slice_beyond_the_ct_has_the_impedance_of_the_other_half():
     assert inside[..., 2].min() < 0.095
 
 
-def test_tubules_are_bright_where_the_beam_meets_them_squarely():
+def test_tubules_are_bright_where_the_beam_meets_them_squarely(one_device):
     """Tubules run along the gradient of the distance to the capsule, here at an angle to the beam."""
     corners = np.moveaxis(np.indices((2, 2, 2)), 0, -1) * 200.0 - 100.0
     index_from_mm = np.diag([1 / 200, 1 / 200, 1 / 200, 1.0])

@@ -4,14 +4,10 @@ colours.
 
 import numpy as np
 import pytest
-import trimesh
 from conftest import rotation_about
-from particle_tissue import tissue_of
+from particle_tissue import carried_along
 from test_bmode import TISSUE, Tank, flat_tank, probe_of
 
-from sim.body import BodyState
-from sim.device import start
-from sim.embedding import Embedding
 from sim.fields import array_of, fill
 from ultrasound.acoustics import BACKSCATTER, properties
 from ultrasound.blood_flow import BEAT_S, SYSTOLE_S
@@ -61,8 +57,7 @@ class Vessel:
 
 
 @pytest.fixture(scope="module")
-def vessel():
-    start("cpu")
+def vessel(one_device):
     return Vessel()
 
 
@@ -156,13 +151,8 @@ def blood_behind(axis: int, voxel_mm: float, count: int) -> SampledVolume:
 
 def test_tissue_that_turns_turns_its_flow(vessel):
     """Blood that flows to the left at rest, in tissue that is turned by 40 degrees."""
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=12.0)
-    model = tissue_of(ball)
-    embedding = Embedding(model.carrier, ball, 4.0)
-    x = (model.body.rest_points @ rotation_about([0, 0, 1], 40.0).T).astype(np.float32)
-    model.body.restore(BodyState(x, np.zeros_like(x)))
-    model.update_frames()
-    embedding.update()
+    embedding, move = carried_along()
+    move(rotation_about([0, 0, 1], 40.0), np.zeros(3))
     tank = flat_tank(0.5, embedding=embedding)
     tank.fill(backscatter=0.01)
     vessel.set_flow([0.3, 0.0, 0.0])

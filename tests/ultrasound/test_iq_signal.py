@@ -6,7 +6,6 @@ from conftest import rotation_about
 from scipy import io, signal
 from test_bmode import BOUNDLESS, Tank, probe_of, speed_ratio
 
-from sim.device import start
 from ultrasound.bmode import Wavefront
 from ultrasound.iq_signal import RF_PER_PERIOD, iq_signal, rf_of, save_iq
 from ultrasound.probe import Probe
@@ -16,8 +15,7 @@ SETTINGS = dict(depth_mm=20.0, transducer_width_mm=16.0, focus_depth_percent=50.
 
 
 @pytest.fixture(scope="module")
-def tank():
-    start("cpu")
+def tank(one_device):
     tank = Tank((BOUNDLESS,) * 3, (1, 1, 1), (0.0, 0.0, 0.0))
     tank.fill(1.5804, 0.0, 0.1)
     return tank

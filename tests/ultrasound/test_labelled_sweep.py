@@ -225,6 +225,12 @@ def over_tumour() -> np.ndarray:
     return way
 
 
+def places_of_pixels(count: int, matrix: np.ndarray) -> np.ndarray:
+    """Where a matrix takes the pixels of a square image, (rows, columns, 3)."""
+    row, column = np.indices((count, count))
+    return (np.stack([column, row, 0 * row, 1 + 0 * row], axis=-1) @ matrix.T)[..., :3]
+
+
 def test_the_matrices_of_a_frame_are_of_its_rows_and_columns(tmp_path):
     probe, pose = load_probe("curvilinear"), np.eye(4)
     pose[:3, 3] = 3.0, -2.0, 7.0
@@ -261,12 +267,9 @@ def test_compression_correction_follows_the_tracked_path_and_leaves_tissue_at_re
     places = CompressionCorrection(still, sweep, image_poses_of(sweep, "Reference"), "Reference")
     begun = len(at)
     assert begun == (compression_correction.APPROACH_S + compression_correction.SETTLE_S) * 60
-    row, column = np.indices((32, 32))
-    pixels = np.stack([column, row, 0 * row, 1 + 0 * row], axis=-1)
     for frame, pose in enumerate(way):
         # Float32 of 1300 mm, less its origin.
-        expected = (pixels @ (pose @ on_probe).T)[..., :3]
-        assert places(frame) == pytest.approx(expected, abs=1e-3)
+        assert places(frame) == pytest.approx(places_of_pixels(32, pose @ on_probe), abs=1e-3)
         face = at[-1] @ [0, 0, -10.0, 1]
         assert face[:3] + ORIGIN == pytest.approx(pose[:3, 3])
     # 0.1 s, and a pause of 8.9 s cut to 2.
@@ -287,11 +290,10 @@ def swept(tmp_path_factory) -> Path:
     organ, tumour = (load_surface(phantom_folder() / f"{name}.stl") for name in ("organ", "tumour"))
     probe = load_probe("drop-in")
     sweep = LabelledSweep(folder, "over", probe)
-    row, column = np.indices((64, 64))
-    pixels = np.stack([column, row, 0 * row, 1 + 0 * row], axis=-1).reshape(-1, 4)
     way = over_tumour()
-    places = np.concatenate([(pixels @ (pose @ probe.image_to_probe(64, 64)).T)[:, :3] for pose in way])
-    inside = [signed_distance(each.vertices, each.faces, places)[0] < 0 for each in (organ, tumour)]
+    places = [places_of_pixels(64, pose @ probe.image_to_probe(64, 64)) for pose in way]
+    places = np.reshape(places, (-1, 3))
+    inside = [signed_distance(part.vertices, part.faces, places)[0] < 0 for part in (organ, tumour)]
     marks = np.where(inside[1], PixelLabel.TUMOUR, inside[0]).astype(np.uint8).reshape(-1, 64, 64)
     for k, (pose, each) in enumerate(zip(way, marks, strict=True)):
         sweep.add(40 + 80 * each, each, probe, pose, k / 10)

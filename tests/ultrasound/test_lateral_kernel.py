@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from test_bmode import GEOMETRIES, LINES, flat_tank, probe_of
 
-from sim.device import start
 from sim.fields import array_of
 from ultrasound.beam import lateral_profiles
 from ultrasound.lateral_kernel import (
@@ -85,8 +84,7 @@ def test_clutter_is_the_energy_of_the_profile_beyond_the_kernel():
         assert row.sum() == pytest.approx(energy[beyond].sum() / energy[~beyond].sum(), rel=0.35)
 
 
-def test_scanlines_are_summed_by_their_weights_and_mirrored_at_the_arrays_ends():
-    start("cpu")
+def test_scanlines_are_summed_by_their_weights_and_mirrored_at_the_arrays_ends(one_device):
     tank, probe = flat_tank(0.5), probe_of(focus_depth_percent=70.0, f_number=2.0)
     tank.fill(backscatter=0.1)
     found = tank.look(probe, "speckle") - probe.gain_db()

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from test_bmode import GAS, TISSUE, depths, flat_tank, peaks, probe_of, speed_ratio
 
-from sim.device import start
 from sim.fields import array_of
 from ultrasound.interface import Surface
 from ultrasound.probe import BUILD_UP_MM
@@ -29,8 +28,7 @@ SILENT = 1e-9
 
 
 @pytest.fixture(scope="module")
-def tank():
-    start("cpu")
+def tank(one_device):
     return flat_tank(0.5)
 
 

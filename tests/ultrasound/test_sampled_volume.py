@@ -8,42 +8,35 @@ import trimesh
 from conftest import rotation_about
 from scipy.interpolate import RegularGridInterpolator
 
-from sim.fields import array_of, fill, zeros
+from sim.fields import array_of, field_of, fill, zeros
 from sim.kernels import kernel
 from ultrasound.sampled_volume import LANES, Lanes, SampledVolume, distance_volume
+
+
+@kernel
+def sample_each(volume: ti.template(), points: ti.template(), values: ti.template()):
+    for i in range(points.shape[0]):
+        values[i] = volume.sample(points[i])
+
+
+def sampled(volume: SampledVolume, points: np.ndarray, *parts: int) -> np.ndarray:
+    """Values (n, *parts) at points (n, 3), each asked for by itself."""
+    values = zeros(len(points), *parts, within=len(parts))
+    sample_each(volume, field_of(points, 1), values)
+    return array_of(values)
 
 
 def test_a_volume_of_vectors_is_sampled_as_each_of_its_parts(device):
     voxels = np.random.default_rng(2).normal(size=(5, 4, 3, 2)).astype(np.float32)
     index_from_mm = np.eye(4)
     index_from_mm[:3, :3] = rotation_about([1, 2, 3], 30) * 0.8
-    whole, parts = (
-        SampledVolume(voxels, index_from_mm),
-        [SampledVolume(voxels[..., k], index_from_mm) for k in range(2)],
-    )
-    points = np.random.default_rng(3).uniform(-1.0, 4.0, (200, 3)).astype(np.float32)
-    given, found = zeros(len(points), 3, within=1), zeros(len(points), 2, within=1)
-    apart = zeros(len(points), 2, within=1)
-    fill((given, points))
-
-    @kernel
-    def ask(
-        whole: ti.template(),
-        parts: ti.template(),
-        given: ti.template(),
-        found: ti.template(),
-        apart: ti.template(),
-    ):
-        for i in range(given.shape[0]):
-            found[i] = whole.sample(given[i])
-            for k in ti.static(range(2)):
-                apart[i][k] = parts[k].sample(given[i])
-
-    ask(whole, parts, given, found, apart)
+    points = np.random.default_rng(3).uniform(-1.0, 4.0, (200, 3))
+    whole = sampled(SampledVolume(voxels, index_from_mm), points, 2)
+    apart = [sampled(SampledVolume(voxels[..., k], index_from_mm), points) for k in range(2)]
     # The compiler may fuse the same sums differently: rounding of values of 4, at a place rounded to 1e-6 of
     # a voxel.
-    assert array_of(found) == pytest.approx(array_of(apart), abs=1e-5)
-    assert (array_of(found) != -1000.0).any() and (array_of(found) == -1000.0).any()
+    assert whole == pytest.approx(np.stack(apart, axis=1), abs=1e-5)
+    assert (whole != -1000.0).any() and (whole == -1000.0).any()
 
 
 @pytest.mark.parametrize("shape", [(6, 5, 4), (6, 1, 4)])
@@ -128,37 +121,18 @@ def test_the_gradient_of_a_volume_is_that_over_a_voxel_to_each_side_and_its_slop
 
 def test_a_volume_is_trilinear_between_voxels_and_ends_half_a_voxel_beyond(device):
     voxels = np.random.default_rng(1).normal(size=(5, 4, 3)).astype(np.float32)
-    volume = SampledVolume(voxels, np.eye(4), outside=-7.0)
-    points = np.array(
-        [[0, 0, 0], [4, 3, 2], [1.25, 2.5, 0.75], [-0.4, 1, 1], [-0.6, 1, 1], [4.6, 3, 2]], np.float32
-    )
-    given = zeros(len(points), 3, within=1)
-    found = zeros(len(points))
-    fill((given, points))
-
-    @kernel
-    def ask(volume: ti.template(), given: ti.template(), found: ti.template()):
-        for i in range(given.shape[0]):
-            found[i] = volume.sample(given[i])
-
-    ask(volume, given, found)
+    points = np.array([[0, 0, 0], [4, 3, 2], [1.25, 2.5, 0.75], [-0.4, 1, 1], [-0.6, 1, 1], [4.6, 3, 2]])
     cell = voxels[1:3, 2:4, 0:2].astype(float)
     mixed = np.einsum("ijk,i,j,k->", cell, [0.75, 0.25], [0.5, 0.5], [0.25, 0.75])
     wanted = [voxels[0, 0, 0], voxels[4, 3, 2], mixed, voxels[0, 1, 1], -7.0, -7.0]
-    assert array_of(found) == pytest.approx(np.array(wanted), abs=1e-5)
+    values = sampled(SampledVolume(voxels, np.eye(4), outside=-7.0), points)
+    assert values == pytest.approx(np.array(wanted), abs=1e-5)
 
 
 def test_a_volume_of_one_slice_is_sampled_within_its_thickness(device):
     volume = SampledVolume(np.full((3, 3, 1), 5.0, np.float32), np.eye(4))
-    found = zeros(2)
-
-    @kernel
-    def ask(volume: ti.template(), found: ti.template()):
-        found[0] = volume.sample(ti.Vector([1.2, 0.7, 0.3]))
-        found[1] = volume.sample(ti.Vector([1.2, 0.7, 0.7]))
-
-    ask(volume, found)
-    assert array_of(found) == pytest.approx([5.0, -1000.0])
+    points = np.array([[1.2, 0.7, 0.3], [1.2, 0.7, 0.7]])
+    assert sampled(volume, points) == pytest.approx([5.0, -1000.0])
 
 
 def test_distance_volume_is_signed(device, ball):
