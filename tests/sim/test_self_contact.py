@@ -77,7 +77,8 @@ def pairs_pass(solver: Solver, moved: np.ndarray, factor: float) -> tuple[np.nda
     """
     pairs, body = solver.self_contacts, solver.body
     x = moved + array_of(body.position)
-    mass = array_of(body.mass_scale).astype(float) if body.mass_scaled else np.ones(len(x))
+    # The lower is the heavier, against gravity along -z.
+    mass = np.exp(-body.mass_scaling_per_mm * x[:, 2])
     row, count = array_of(pairs.neighbour), array_of(pairs.neighbour_count)
     change, touching, sticks, slides = np.zeros_like(x), np.zeros(len(x)), 0, 0
     for i in range(len(x)):

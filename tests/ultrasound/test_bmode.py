@@ -509,9 +509,7 @@ def test_speckle_correlates_as_the_point_spread_function_does(endless):
             assert correlation == pytest.approx(lateral[lag] if axis == 1 else axial, abs=0.07)
 
 
-@pytest.mark.parametrize(
-    "axis, tilt", [((1, 0.4, 0.2), 0), ((1, 0.4, 0.2), 25), ((1, 0.4, 0.2), 62), ((0.1, 1, 0), 75)]
-)
+@pytest.mark.parametrize("axis, tilt", [((1, 0.4, 0.2), 0), ((1, 0.4, 0.2), 62), ((0.1, 1, 0), 75)])
 def test_speckle_decorrelates_across_the_plane_as_the_beam_does(endless, axis, tilt):
     """Elevational steps of a sweep, also where the plane is aslant to all axes of the tissue."""
     probe = probe_of(depth_mm=40.0)
@@ -563,7 +561,7 @@ def test_tissue_and_probe_moved_alike_give_the_same_picture(moved, elevation):
     assert np.abs(tank.look(probe, "speckle", face) - first).mean() > 3.0
 
 
-@pytest.mark.parametrize("across, along, shear", [(0.01, -0.02, 0.0), (0.0, -0.03, 0.0), (0.0, -0.01, 0.02)])
+@pytest.mark.parametrize("across, along, shear", [(0.01, -0.03, 0.0), (0.0, -0.01, 0.02)])
 def test_tracked_speckle_moves_as_the_tissue_does(moved, across, along, shear):
     (tank, move), probe = moved, probe_of(**SMALL)
     tank.fill(attenuation=0.5, backscatter=0.1)

@@ -47,11 +47,16 @@ NWIRE_XML = "us/PlusDeviceSet_NwirePhantomFreehand_vtkVolumeReconstructorTest2.x
 FULL = "File too large"
 
 
+def status_of(*arguments) -> int:
+    """The exit status of a command."""
+    return app.main([str(argument) for argument in arguments])
+
+
 def refused(*arguments) -> str:
     """The one line with which a command is refused."""
     told = io.StringIO()
     with redirect_stderr(told):
-        status = app.main([str(argument) for argument in arguments])
+        status = status_of(*arguments)
     lines = [line for line in told.getvalue().strip().splitlines() if "image/s" not in line]
     assert status == 2 and len(lines) == 1 and lines[0].startswith("nephron: "), told.getvalue()
     return lines[0]
@@ -338,8 +343,8 @@ def test_a_sweep_is_described_by_its_steps_and_speeds():
 
 
 def test_reconstruct_makes_a_volume_and_compares_it(swept, tmp_path, capsys):
-    command = ["reconstruct", swept, "--scene", EMBEDDED, "--spacing-mm", "1", "--out", tmp_path / "out"]
-    assert app.main([str(part) for part in command]) == 0
+    scene = "--scene", EMBEDDED
+    assert status_of("reconstruct", swept, *scene, "--spacing-mm", "1", "--out", tmp_path / "out") == 0
     report = json.loads((tmp_path / "out" / "report.json").read_text(), parse_constant=pytest.fail)
     assert (report["frames"], report["used"], report["method"]) == (14, 14, "smooth")
     assert report["version"] == VERSION
@@ -351,12 +356,7 @@ def test_reconstruct_makes_a_volume_and_compares_it(swept, tmp_path, capsys):
     assert organ["scanned"] < 0.3 < 0.5 < tumour["scanned"] < 1
     # As balls of the same volume: an outline that is off by a quarter of a voxel on average.
     assert tumour["scanned_part"]["dice"] > 0.95 and tumour["scanned_part"]["centroid_mm"] < 0.2
-    told = capsys.readouterr().out
-    assert (
-        "14 of 14 with a pose, 1.50 mm apart" in told and f"Dice {tumour['scanned_part']['dice']:.3f}" in told
-    )
-    assert f"organ     {100 * organ['scanned']:.0f} % scanned; only in this small part Dice" in told
-    assert f"tumour    {100 * tumour['scanned']:.0f} % scanned; in this part Dice" in told
+    assert f"tumour    {100 * tumour['scanned']:.0f} % scanned; in this part Dice" in capsys.readouterr().out
     volume, labels = (sitk.ReadImage(str(tmp_path / "out" / f"{name}.nrrd")) for name in ("volume", "labels"))
     assert list(volume.GetSize()) == report["shape"] == list(labels.GetSize())
     middle = load_surface(phantom_folder() / "tumour.stl").center_mass
@@ -370,8 +370,8 @@ def test_reconstruct_compares_no_sweep_with_an_organ_that_it_does_not_show(swept
     organ = load_surface(phantom_folder() / "organ.stl").apply_translation([0, 0, away_mm])
     organ.export(tmp_path / "organ.stl")
     (tmp_path / "scene.toml").write_text('[anatomy]\norgan = "organ.stl"\n')
-    command = ["reconstruct", swept, "--scene", tmp_path, "--spacing-mm", "2", "--out", tmp_path]
-    assert app.main([str(part) for part in command]) == 0
+    scene = "--scene", tmp_path
+    assert status_of("reconstruct", swept, *scene, "--spacing-mm", "2", "--out", tmp_path) == 0
     report, told = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out
     assert report["agreement"] == {} and "Dice" not in told
     assert re.search(r"the sweep covers 0\.[0-9] % of this organ", told)
@@ -414,8 +414,8 @@ def test_reconstruct_refuses_in_one_line(swept, tmp_path, monkeypatch):
 def test_reconstruct_takes_what_plus_wrote(data, tmp_path, capsys, sample, config, used):
     sweep = data / f"us/{sample}.igs.mha"
     assert "no chain of transforms from Image" in refused("reconstruct", sweep, "--out", tmp_path / "none")
-    command = ["reconstruct", sweep, "--config", data / config, "--spacing-mm", "2", "--out", tmp_path]
-    assert app.main([str(part) for part in command]) == 0
+    coarsely = "--spacing-mm", "2", "--out", tmp_path
+    assert status_of("reconstruct", sweep, "--config", data / config, *coarsely) == 0
     report = json.loads((tmp_path / "report.json").read_text())
     assert (
         report["used"] == report["frames"] == (used or len(read_sweep(sweep))) and report["agreement"] == {}
@@ -436,8 +436,8 @@ def test_poses_alone_make_no_volume(data, tmp_path):
 def test_scan_leaves_a_sweep_at_the_poses_of_its_file(tmp_path):
     way = over_tumour()[5:8]
     (tmp_path / "poses.json").write_text(json.dumps([dict(probe_to_patient=pose.tolist()) for pose in way]))
-    command = ["scan", EMBEDDED, "--pose", tmp_path / "poses.json", "--out", tmp_path / "out", "--sweep"]
-    assert app.main([str(part) for part in [*command, "--picture", "ct", "--arch", "cpu"]]) == 0
+    options = "--out", tmp_path / "out", "--sweep", "--picture", "ct", "--arch", "cpu"
+    assert status_of("scan", EMBEDDED, "--pose", tmp_path / "poses.json", *options) == 0
     sweep = read_sweep(tmp_path / "out/sweep.igs.mha")
     marks = read_ground_truth(tmp_path / "out/sweep.igs.mha")
     probe, rows = load_probe("drop-in"), sweep.images.shape[1]
