@@ -350,8 +350,8 @@ class Mouse:
         return any(key in self.held for key in keys)
 
     def get_events(self, tag: str) -> list[SimpleNamespace]:
-        found, self.events[tag] = self.events[tag], []
-        return found
+        events, self.events[tag] = self.events[tag], []
+        return events
 
 
 @pytest.fixture

@@ -132,7 +132,7 @@ PLANNING = "PLANNING   43 %, some 18 min left; Backspace stops"
 )
 def test_a_status_is_as_large_as_it_can_be_in_the_panel(size, status):
     layout = WindowLayout(*size)
-    plain, with_status = (ultrasound_panel.status_image(layout, each).astype(int) for each in ("", status))
+    plain, with_status = (ultrasound_panel.status_image(layout, text).astype(int) for text in ("", status))
     columns = np.flatnonzero(np.any(plain != with_status, axis=(0, 2)))
     room = layout.panel.width - 2 * layout.px(16)
     assert layout.status.width == room

@@ -13,9 +13,9 @@ def test_a_field_holds_an_array(device, kind, within):
     values = np.random.default_rng(0).integers(0, 2 if kind is bool else 100, (5, 4, 3)).astype(kind)
     field = field_of(values, within)
     assert (field.shape, field.element) == (values.shape[: 3 - within], values.shape[3 - within :])
-    found = array_of(field)
-    assert found.dtype == (np.float32 if np.issubdtype(kind, np.floating) else np.int32)
-    assert np.array_equal(found, values)
+    array = array_of(field)
+    assert array.dtype == (np.float32 if np.issubdtype(kind, np.floating) else np.int32)
+    assert np.array_equal(array, values)
 
 
 def test_the_order_in_memory_does_not_matter(device):

@@ -296,7 +296,7 @@ def test_where_counts_are_compiled_another_count_is_another_kernel(device, monke
     owners = [Counted(3, 0.5), Counted(5, 0.5), Counted(5, 2.0)]
     for owner in owners:
         owner.add()
-    assert [array_of(each.values).tolist() for each in owners] == [[3.5] * 3, [5.5] * 5, [7.0] * 5]
+    assert [array_of(owner.values).tolist() for owner in owners] == [[3.5] * 3, [5.5] * 5, [7.0] * 5]
     owners[1].count = 2
     owners[1].add()
     assert array_of(owners[1].values).tolist() == [11.0] * 2 + [5.5] * 3

@@ -123,9 +123,9 @@ def test_force_and_hessian_are_the_energys_derivatives(kept, noise_mm):
 def test_youngs_modulus_changes_the_penalty_stiffness_and_not_poissons_ratio(one_device, block):
     model = tissue_of(block, 8.0, [Plane(np.array([0.0, 0.0, 1.0]), -8.0)], poisson=0.3).model
     model.set_material(2 * YOUNG_KPA)
-    found = model.mu, model.lambda_, model.contacts.stiffness
-    assert found == pytest.approx(
-        [2 * each for each in (*lame_parameters(0.3), YOUNG_KPA / PENALTY_DEPTH_MM)], rel=1e-6
+    moduli = model.mu, model.lambda_, model.contacts.stiffness
+    assert moduli == pytest.approx(
+        [2 * modulus for modulus in (*lame_parameters(0.3), YOUNG_KPA / PENALTY_DEPTH_MM)], rel=1e-6
     )
 
 
@@ -133,18 +133,18 @@ def test_the_logarithm_is_exact_to_rounding(one_device):
     values = np.concatenate([np.geomspace(LEAST_J, 1e30, 4000), 1 + np.linspace(-0.4, 0.4, 4001)]).astype(
         np.float32
     )
-    given, found = zeros(len(values)), zeros(len(values))
-    fill((given, values))
+    number, logarithm = zeros(len(values)), zeros(len(values))
+    fill((number, values))
 
     @kernel
-    def ask(given: ti.template(), found: ti.template()):
-        for i in range(given.shape[0]):
-            found[i] = ln(given[i])
+    def ask(number: ti.template(), logarithm: ti.template()):
+        for i in range(number.shape[0]):
+            logarithm[i] = ln(number[i])
 
-    ask(given, found)
+    ask(number, logarithm)
     wanted = np.log(values.astype(float))
     # Of the sum of exponent and series each rounds by half a unit, the series' own terms by three more.
-    assert (np.abs(array_of(found) - wanted) <= 4 * EPS * np.maximum(np.abs(wanted), 0.35)).all()
+    assert (np.abs(array_of(logarithm) - wanted) <= 4 * EPS * np.maximum(np.abs(wanted), 0.35)).all()
 
 
 @pytest.mark.parametrize("with_fixed", [False, True])

@@ -159,19 +159,19 @@ def test_the_quick_distance_test_of_a_tool_has_no_false_positives(one_device, ed
     tool.move(pose, pose)
     points = scattered()
     _, distance = measured(tool, points)
-    given, beyond = zeros(len(points), 3, within=1), zeros(len(points), kind=ti.i32)
-    fill((given, points))
+    place, beyond = zeros(len(points), 3, within=1), zeros(len(points), kind=ti.i32)
+    fill((place, points))
 
     @kernel
-    def ask(tool: ti.template(), given: ti.template(), beyond: ti.template()):
-        for i in range(given.shape[0]):
-            beyond[i] = ti.cast(tool.is_beyond(given[i], 2.0), ti.i32)
+    def ask(tool: ti.template(), place: ti.template(), beyond: ti.template()):
+        for i in range(place.shape[0]):
+            beyond[i] = ti.cast(tool.is_beyond(place[i], 2.0), ti.i32)
 
-    ask(tool, given, beyond)
-    told = array_of(beyond) > 0
-    assert (distance[told] > 2.0).all()
+    ask(tool, place, beyond)
+    is_far = array_of(beyond) > 0
+    assert (distance[is_far] > 2.0).all()
     # It sees most of what is beyond, all but what is near to an edge's or corner's corner.
-    assert told.sum() > 0.9 * (distance > 2.0).sum()
+    assert is_far.sum() > 0.9 * (distance > 2.0).sum()
 
 
 def under_a_tool(mesh) -> Solver:

@@ -73,9 +73,9 @@ def test_the_mixture_is_the_mean_by_volume():
     stiff, light = Material(60.0, 0.3, 2.0), Material(1.0, 0.499, 0.9)
     share = np.array([[0.0, 0.0], [1.0, 0.0], [0.25, 0.5]])
     mu, lambda_, density = mixture(OUTSIDE, [stiff, light], share)
-    for found, name in ((mu, "mu"), (lambda_, "lambda_"), (density, "density")):
+    for mean, name in ((mu, "mu"), (lambda_, "lambda_"), (density, "density")):
         out, first, second = (getattr(m, name) for m in (OUTSIDE, stiff, light))
-        assert found == pytest.approx([out, first, 0.25 * out + 0.25 * first + 0.5 * second], rel=1e-12)
+        assert mean == pytest.approx([out, first, 0.25 * out + 0.25 * first + 0.5 * second], rel=1e-12)
     assert (OUTSIDE.mu, OUTSIDE.lambda_) == pytest.approx(lame_parameters(0.45), rel=1e-12)
 
 

@@ -83,9 +83,9 @@ def test_counts_on_a_real_kidney_are_those_of_the_papers_scale(data):
     # The paper's Fig. 5 has about 15 000 particles and 400 clusters at 2.2 mm for a kidney of this size: at
     # 3.3 mm 4500.
     kidney = trimesh.load_mesh(data / "truth" / "kits040" / "kidney.stl")
-    found = fill_body(kidney, 3.3).particles
-    assert len(found) == pytest.approx(4614, rel=0.01)
-    assert 100 < sample_clusters(found, 3.33 * 3.3).shape[0] < 450
+    particles = fill_body(kidney, 3.3).particles
+    assert len(particles) == pytest.approx(4614, rel=0.01)
+    assert 100 < sample_clusters(particles, 3.33 * 3.3).shape[0] < 450
 
 
 def test_too_little_memory_is_refused_with_the_amount_needed(ball, monkeypatch):

@@ -178,11 +178,11 @@ def test_patches_have_each_membership_of_the_clusters(block):
         frozenset(map(tuple, rest.particles[clusters.indices[a:b]])) for a, b in pairwise(clusters.indptr)
     }
     rows = [patches.clusters.indices[a:b] for a, b in pairwise(patches.clusters.indptr)]
-    found: dict[int, set] = {}
+    memberships: dict[int, set] = {}
     for particle, p in zip(arranged.particles, patches.of_particles(), strict=True):
         for c in rows[p]:
-            found.setdefault(int(c), set()).add(tuple(particle))
-    assert {frozenset(members) for members in found.values()} == wanted
+            memberships.setdefault(int(c), set()).add(tuple(particle))
+    assert {frozenset(members) for members in memberships.values()} == wanted
     # No two patches are in the same clusters, and those with several particles come first.
     assert len({row.tobytes() for row in rows}) == len(patches)
     assert (patches.sizes[: patches.multi_count] > 1).all() and (

@@ -117,8 +117,8 @@ def test_the_tool_follows_its_poses_and_stays_at_the_last(kept, block, serial):
     solver = solver_of(block, [tool], tool=tool, serial=serial)
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, :3, 3] = 30.0 + np.array([[0.0], [0.5], [1.5], [3.5]]) * [1.0, -2.0, 3.0]
-    for given, motion in ((poses, [2.0, -4.0, 6.0]), (None, [0.0] * 3)):
-        solver.step(StepSettings(substeps=3, iterations=1), given)
+    for way, motion in ((poses, [2.0, -4.0, 6.0]), (None, [0.0] * 3)):
+        solver.step(StepSettings(substeps=3, iterations=1), way)
         assert np.array_equal(array_of(tool.pose), poses[-1].astype(np.float32))
         # Back to where it was a substep before.
         assert array_of(tool.step_back)[:3, 3] == pytest.approx(-np.array(motion), abs=1e-5)

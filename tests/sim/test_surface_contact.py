@@ -218,7 +218,7 @@ def test_forces_and_stiffnesses_are_those_of_the_penalty_law(kept, dome):
     pushed, held = (zeros(n, 4, 3, within=2) for n in (solver.body.count, contacts.count))
     ask(contacts, pushed, held, at)
     # Rounding of 1e-6 mm is a few thousandths of a percent of the deepest, and of the largest slip.
-    pushed, held = (array_of(each).astype(float) for each in (pushed, held))
+    pushed, held = (array_of(field).astype(float) for field in (pushed, held))
     ways = np.zeros(3), motion
     laws = [layer_of(contacts, s, places, way, places - known - way) for s, way in enumerate(ways)]
     assert all(law[2].sum() > 5 for law in laws) and 3 < sum(law[3].sum() for law in laws) < 100

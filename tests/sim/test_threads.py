@@ -47,11 +47,11 @@ def rehearsed(threads: int) -> str:
     colour = anatomy.scanner.doppler(pictures, "colour")
     state = organ.body.snapshot()
     arrays = state.position, state.velocity, organ.wrench(), *pictures.by_name.values(), colour
-    return hashlib.sha256(b"".join(each.tobytes() for each in arrays)).hexdigest()
+    return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
 
 
 def test_a_rehearsal_gives_the_same_bits_after_another_start_with_more_threads(arrays_stored, monkeypatch):
     for module in (neo_hookean, embedding):
-        monkeypatch.setattr(module, "is_too_small", lambda *given: False)
+        monkeypatch.setattr(module, "is_too_small", lambda *counts: False)
     assert rehearsed(2) == rehearsed(4)
     ti.reset()

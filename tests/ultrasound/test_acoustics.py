@@ -160,7 +160,9 @@ def test_an_unknown_tissue_is_refused_with_those_known():
 def test_stored_properties_are_computed_once_and_anew_for_another_table(monkeypatch, tmp_path):
     computed: list[int] = []
     monkeypatch.setattr(stored_arrays, "FOLDER", tmp_path / "arrays")
-    monkeypatch.setattr(acoustics, "properties", lambda *given: computed.append(1) or properties(*given))
+    monkeypatch.setattr(
+        acoustics, "properties", lambda *voxels_of: computed.append(1) or properties(*voxels_of)
+    )
     hu = np.random.default_rng(0).integers(-50, 90, (9, 8, 7)).astype(np.float32)
     labels, spacing = np.zeros(hu.shape, np.uint8), np.array([1.0, 2.0, 3.0])
     labels[3:6, 2:6, 2:5] = 2
@@ -191,10 +193,10 @@ def test_voxels_have_their_spacing_along_their_own_axes():
 def test_the_same_voxels_have_the_same_properties():
     hu, labels = labelled()
     hu += np.random.default_rng(1).normal(0, 12, SHAPE).astype(np.float32)
-    given = hu.copy(), labels.copy()
+    before = hu.copy(), labels.copy()
     first = properties(hu, labels, {1: "kidney"}, np.array([0.8, 0.9, 1.0]))
     assert (properties(hu, labels, {1: "kidney"}, np.array([0.8, 0.9, 1.0])) == first).all()
-    assert (hu == given[0]).all() and (labels == given[1]).all()
+    assert (hu == before[0]).all() and (labels == before[1]).all()
     assert np.isfinite(first).all() and (first[..., :ANISOTROPY] > 0).all()
 
 
@@ -284,7 +286,7 @@ def variation(hu: np.ndarray, tissue: str = "kidney", spacing_mm: float = 1.0) -
     """
     labels, spacing = np.ones(hu.shape, np.uint8), np.full(3, spacing_mm)
     varied, even = (
-        properties(each.astype(np.float32), labels, {1: tissue}, spacing) for each in (hu, 0 * hu + 40)
+        properties(values.astype(np.float32), labels, {1: tissue}, spacing) for values in (hu, 0 * hu + 40)
     )
     assert np.array_equal(varied[..., :BACKSCATTER], even[..., :BACKSCATTER])
     return decibel_of(varied) - decibel_of(even)
@@ -299,11 +301,11 @@ def stripes(width: int, hu: float) -> np.ndarray:
 @pytest.mark.parametrize("tissue", TISSUES)
 def test_what_is_denser_in_the_ct_scatters_more_and_the_mean_stays(tissue):
     """But for fluids and what is drawn."""
-    found = variation(stripes(20, 10.0), tissue)
-    middle = found[[10, 30, 50, 70], 10, 10]
+    level = variation(stripes(20, 10.0), tissue)
+    middle = level[[10, 30, 50, 70], 10, 10]
     # Amid stripes as wide as 13 SDs of the smoothing all of it is there; in float32 of some -40 dB.
     factor = tissue_table()[tissue].get("follows_hu", 0.0)
-    assert factor or not found.any()
+    assert factor or not level.any()
     assert middle == pytest.approx(factor * DB_OF_HU * np.array([-10.0, 10.0, -10.0, 10.0]), abs=1e-4)
     assert (factor < 0) == (tissue in DARKER)
     # Half of the voxels are above the tissue's median as far as the other half is below it.
@@ -311,11 +313,11 @@ def test_what_is_denser_in_the_ct_scatters_more_and_the_mean_stays(tissue):
 
 
 def test_a_few_decibels_are_the_most_that_hu_make():
-    found = variation(stripes(20, 800.0))
-    assert found[[10, 30, 50, 70], 10, 10] == pytest.approx(
+    level = variation(stripes(20, 800.0))
+    assert level[[10, 30, 50, 70], 10, 10] == pytest.approx(
         MOST_OF_HU_DB * np.array([-1, 1, -1, 1]), abs=1e-4
     )
-    assert 2.0 <= np.abs(found).max() <= MOST_OF_HU_DB + 1e-4 <= 4.0
+    assert 2.0 <= np.abs(level).max() <= MOST_OF_HU_DB + 1e-4 <= 4.0
 
 
 def test_the_border_of_two_tissues_is_no_variation_however_far_apart_their_hu_are():
@@ -336,13 +338,13 @@ def gaussian(sd: float, reach_sd: float) -> np.ndarray:
 def test_noise_of_a_ct_does_not_become_texture(spacing):
     shape, sd_hu = (72, 72, 72), 12.0
     noise = np.random.default_rng(4).normal(40, sd_hu, shape)
-    found = variation(noise, spacing_mm=spacing)[8:-8, 8:-8, 8:-8].std()
+    sd = variation(noise, spacing_mm=spacing)[8:-8, 8:-8, 8:-8].std()
     # White noise through a kernel keeps its SD times the root of the sum of the kernel's squares; along each
     # axis the kernel is two Gaussians, that of HU and that of the level, one after the other.
     kernel = np.convolve(gaussian(OF_HU_MM / spacing, 2.0), gaussian(LEVEL_SMOOTHING_VOXELS, 2.5))
     wanted = DB_OF_HU * sd_hu * (kernel**2).sum() ** 1.5
     # Of 56^3 voxels some 56^3 / (2 sqrt(pi) s)^3 are independent: at least 500, of which the SD is known to 1
     # / sqrt(1000).
-    assert found == pytest.approx(wanted, rel=0.08)
+    assert sd == pytest.approx(wanted, rel=0.08)
     # Less than a third of the texture of parenchyma.
-    assert found < 0.35 * tissue_table()["kidney"]["texture_db"]
+    assert sd < 0.35 * tissue_table()["kidney"]["texture_db"]

@@ -214,9 +214,9 @@ def test_what_was_not_imaged_is_the_gap(organ, first, last):
     sweep(organ, first, last)
     caps = sorted([cap(R + x) for x in (first, -last) if R + x > 0], reverse=True)
     sides = {first: -1, last: 1}
-    found = organ.gaps("organ")
-    assert len(found) == len(caps)
-    for gap, volume in zip(found, caps, strict=True):
+    gaps = organ.gaps("organ")
+    assert len(gaps) == len(caps)
+    for gap, volume in zip(gaps, caps, strict=True):
         edge = first if np.isclose(volume, cap(R + first)) and first > -R else last
         # The edge lies half a voxel off at most; facets take 1.2 % of a volume.
         off = VOXEL_MM / 2 * np.pi * (R**2 - edge**2) / 1000

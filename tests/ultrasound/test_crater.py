@@ -90,8 +90,8 @@ def test_the_box_has_all_voxels_that_it_changes_and_ends_with_the_volume(device)
     volume = volume_of(np.zeros((10, 12, 11), np.float32))
     crater = Crater(SURFACE, "air")
     box, values = crater.replaced(volume, crater.hu())
-    assert all(0 <= each.start < each.stop <= n for each, n in zip(box, volume.shape, strict=True))
-    assert values.shape == tuple(each.stop - each.start for each in box)
+    assert all(0 <= side.start < side.stop <= n for side, n in zip(box, volume.shape, strict=True))
+    assert values.shape == tuple(side.stop - side.start for side in box)
     far = Crater(SURFACE.copy().apply_translation([500.0, 0, 0]), "air")
     assert far.replaced(volume, far.hu())[1].size == 0
 

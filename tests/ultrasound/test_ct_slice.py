@@ -185,23 +185,23 @@ def test_the_pixel_near_a_place_is_the_nearest(one_device):
     plane = PlaneInTissue(Unmoved(), 24)
     plane.locate(ImagePlane(np.eye(4), 30.0, 18.0, 4.0))
     places = np.random.default_rng(6).uniform([-20, -8], [20, 18], (300, 2)).astype(np.float32)
-    found = np.zeros((300, 2), np.int32)
+    pixels = np.zeros((300, 2), np.int32)
 
     @kernel
     def ask(
         plane: ti.template(),
         places: ti.types.ndarray(ti.f32, ndim=2),
-        found: ti.types.ndarray(ti.i32, ndim=2),
+        pixels: ti.types.ndarray(ti.i32, ndim=2),
     ):
         for i in range(300):
             at = tm.vec2(places[i, 0], places[i, 1])
-            found[i, 0], found[i, 1] = plane.pixel_near(at)
+            pixels[i, 0], pixels[i, 1] = plane.pixel_near(at)
 
-    ask(plane, places, found)
+    ask(plane, places, pixels)
     middles = (np.arange(24) + 0.5) / 24
     u, v = middles * 30.0 - 15.0, middles * 18.0 - 4.0
-    assert np.array_equal(found[:, 0], np.abs(places[:, 1:] - v).argmin(axis=1))
-    assert np.array_equal(found[:, 1], np.abs(places[:, :1] - u).argmin(axis=1))
+    assert np.array_equal(pixels[:, 0], np.abs(places[:, 1:] - v).argmin(axis=1))
+    assert np.array_equal(pixels[:, 1], np.abs(places[:, :1] - u).argmin(axis=1))
 
 
 def test_every_pixel_finds_the_tetrahedron_that_holds_it(kept, ball):
@@ -250,9 +250,9 @@ def test_fewer_pixels_are_in_the_tetrahedra_of_the_places_that_they_show(kept, b
     # Of three pixels the middle one has the centre of a pixel three times as large.
     middle = tuple(slice(1, None, 3) if count == 32 else slice(None) for count in shape)
     cut.plane.locate(plane, shape)
-    found = array_of(cut.plane.owner)[: shape[0], : shape[1]]
+    fewer = array_of(cut.plane.owner)[: shape[0], : shape[1]]
     # Rounding decides on what is between two tetrahedra.
-    assert (found != owner[middle]).mean() < 0.002 and (found < embedding.count).mean() > 0.2
+    assert (fewer != owner[middle]).mean() < 0.002 and (fewer < embedding.count).mean() > 0.2
     # Places that are measured stay where they are; a map continues up to 0.4 mm beyond its tetrahedron, which
     # is bent by 0.1 per mm.
     inside = owner < embedding.count
@@ -282,8 +282,8 @@ def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(kept
         assert np.linalg.det(edges[owner[row, column]]) < 0
     assert overlaps > 50
     # One after the other or in parallel: the same.
-    given = np.linalg.inv(plane.world_from_plane), plane.world_from_plane, *array_of(cut.plane.grid)
-    matrices = [ti.Matrix(each.tolist()) for each in given]
+    axes = np.linalg.inv(plane.world_from_plane), plane.world_from_plane, *array_of(cut.plane.grid)
+    matrices = [ti.Matrix(values.tolist()) for values in axes]
     other = copy(embedding)
     other.serial = not embedding.serial
     fill_evenly(cut.plane.owner, -1)

@@ -126,7 +126,9 @@ def test_it_says_that_it_is_simulated_and_names_nobody(file):
     data = pydicom.dcmread(file)
     not_text = ("DS", "FD", "IS", "OB", "SL", "SQ", "UI", "UL", "US")
     texts = {
-        each.keyword: each.value for each in data.iterall() if each.VR not in not_text and not each.is_empty
+        element.keyword: element.value
+        for element in data.iterall()
+        if element.VR not in not_text and not element.is_empty
     }
     assert texts == {
         "ImageType": ["DERIVED", "SECONDARY"],

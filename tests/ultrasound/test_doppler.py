@@ -43,17 +43,17 @@ class Vessel:
     def set_flow(self, velocity_m_s, resistive_index=0.0, amplitude=1.0) -> None:
         fill((self.flow.voxels, np.tile([*velocity_m_s, resistive_index, amplitude], (8, 1))))
 
-    def look(self, probe: Probe, time_s: float = SYSTOLE_S, **given) -> np.ndarray:
+    def look(self, probe: Probe, time_s: float = SYSTOLE_S, **settings) -> np.ndarray:
         """Velocities (beats, scanlines, samples) [cm/s] of the middle of the image at the same time of
         several beats.
         """
         self.tank.look(probe, "speckle")
         doppler = self.steered if probe.colour_steering_deg else self.straight
-        found = []
+        velocities = []
         for beat in range(BEATS):
-            doppler.estimate(probe, time_s + beat * BEAT_S, **given)
-            found.append(doppler.velocity_cm_s(probe)[40:150, 8:60])
-        return np.stack(found)
+            doppler.estimate(probe, time_s + beat * BEAT_S, **settings)
+            velocities.append(doppler.velocity_cm_s(probe)[40:150, 8:60])
+        return np.stack(velocities)
 
 
 @pytest.fixture(scope="module")
@@ -69,9 +69,9 @@ def test_the_velocity_is_that_of_the_doppler_equation(vessel, angle, speed_cm_s)
     turn = np.radians(angle)
     # The angle is between the flow and the direction to the array, which is -y.
     vessel.set_flow(np.array([np.sin(turn), -np.cos(turn), 0.0]) * speed_cm_s / 100)
-    found = np.median(vessel.look(probe))
+    velocity = np.median(vessel.look(probe))
     shift_khz = 2 * probe.frequency_mhz * 1e3 * (speed_cm_s / 100) * np.cos(turn) / 1540
-    assert doppler_shift_khz(probe, found) == pytest.approx(shift_khz, rel=0.05)
+    assert doppler_shift_khz(probe, velocity) == pytest.approx(shift_khz, rel=0.05)
 
 
 def test_blood_echoes_as_a_vessel_in_the_b_mode_image_does():
@@ -85,8 +85,8 @@ def test_steered_scanlines_see_a_vessel_parallel_to_the_face(vessel, steering):
     vessel.tank.fill(backscatter=0.01)
     vessel.set_flow([0.4, 0.0, 0.0])
     probe = probe_of(**SETTINGS, colour_steering_deg=steering)
-    found = np.median(vessel.look(probe))
-    assert found == pytest.approx(-40.0 * np.sin(np.radians(steering)), rel=0.05)
+    velocity = np.median(vessel.look(probe))
+    assert velocity == pytest.approx(-40.0 * np.sin(np.radians(steering)), rel=0.05)
     # Unsteered, nothing passes the wall filter.
     vessel.look(probe_of(**SETTINGS))
     energy = array_of(vessel.straight.moment)[40:150, 8:60, 2]
@@ -159,9 +159,9 @@ def test_tissue_that_turns_turns_its_flow(vessel):
     small = dict(transducer_width_mm=12.0, depth_mm=16.0)
     doppler, probe = estimated(tank, vessel.flow, (0.0, -8.0, 0.0), **small)
     real, imaginary, _ = np.moveaxis(array_of(doppler.moment)[80:110, 20:40], -1, 0)
-    found = np.arctan2(imaginary, real) / np.pi * probe.velocity_limit_cm_s
+    velocity = np.arctan2(imaginary, real) / np.pi * probe.velocity_limit_cm_s
     # Turned, it is (cos 40, sin 40), of which the second is away from the array.
-    assert found == pytest.approx(-30.0 * np.sin(np.radians(40.0)), rel=0.02)
+    assert velocity == pytest.approx(-30.0 * np.sin(np.radians(40.0)), rel=0.02)
 
 
 def test_the_sample_volume_is_as_wide_as_the_beam(vessel):
@@ -171,11 +171,11 @@ def test_the_sample_volume_is_as_wide_as_the_beam(vessel):
     moment = array_of(doppler.moment)[:, 60, 2]
     weight = array_of(doppler.weight)[60]
     assert weight.sum() == pytest.approx(1.0, abs=1e-5) and 1 < array_of(doppler.half)[60] < MAX_HALF_WIDTH
-    found = []
+    estimates = []
     for beat in range(60):
         doppler.estimate(probe, SYSTOLE_S + beat * BEAT_S)
-        found.append(array_of(doppler.mean)[:, 60, 2])
-    mean, wanted = np.mean(found, axis=0), np.convolve(moment, weight[::-1], mode="same")
+        estimates.append(array_of(doppler.mean)[:, 60, 2])
+    mean, wanted = np.mean(estimates, axis=0), np.convolve(moment, weight[::-1], mode="same")
     assert mean[30:160] == pytest.approx(wanted[30:160], abs=0.1 * float(wanted.max()))
     assert np.abs(moment - wanted)[30:160].max() > 0.3 * wanted.max()
 
@@ -198,10 +198,10 @@ def test_tissue_is_left_behind_the_wall_filter_as_bright_as_it_is_where_it_is(ve
     probe, sound = probe_of(**SETTINGS), vessel.tank.bmode.sound
     vessel.look(probe)
     level = array_of(sound.amplitude).astype(float) * array_of(sound.tissue)[..., 2]
-    found = array_of(vessel.straight.moment)[5:150, 8:60, 2]
+    energy = array_of(vessel.straight.moment)[5:150, 8:60, 2]
     assert (
-        found == pytest.approx(level[5:150, 8:60] ** 2 * STOPPED, rel=1e-4, abs=0)
-        and np.ptp(found) > found.min()
+        energy == pytest.approx(level[5:150, 8:60] ** 2 * STOPPED, rel=1e-4, abs=0)
+        and np.ptp(energy) > energy.min()
     )
 
 
@@ -281,13 +281,13 @@ def test_a_colour_is_the_share_of_its_scale(vessel, mode, stops, share, velocity
     vessel.set_flow([0.0, -velocity_cm_s / 100, 0.0], amplitude=np.sqrt(energy) / BLOOD)
     vessel.tank.look(probe, "speckle")
     image = vessel.straight.render(probe, np.zeros((256, 256), np.uint8), mode, SYSTOLE_S)
-    found = np.median(image[40:200, 40:200].reshape(-1, 3), axis=0)
+    colour = np.median(image[40:200, 40:200].reshape(-1, 3), axis=0)
     at = share * (len(stops) - 1)
     expected = [np.interp(at, np.arange(len(stops)), channel) for channel in stops.T]
     # From one stop to the next, a third of the range, a channel changes by up to 200 levels: half a step of
     # 64 is 5 of them, and 1 % of the range, by which the median of some hundred independent samples is off,
     # is 6.
-    assert found == pytest.approx(np.array(expected), abs=11)
+    assert colour == pytest.approx(np.array(expected), abs=11)
 
 
 def test_the_error_of_an_estimate_is_that_of_ten_pulses(vessel):
@@ -299,9 +299,9 @@ def test_the_error_of_an_estimate_is_that_of_ten_pulses(vessel):
     assert 10 * np.log10(noise_energy(probe)) == pytest.approx(-105.0 - 6.0 - 10.0)
     vessel.tank.fill()
     vessel.set_flow([0.0, -0.3, 0.0])
-    found = vessel.look(probe)
+    velocity = vessel.look(probe)
     assert noise_energy(probe) < 1e-3 * BLOOD**2
-    assert np.std(found) / 60.0 * np.pi == pytest.approx(np.sqrt(0.5 / 10), rel=0.15)
+    assert np.std(velocity) / 60.0 * np.pi == pytest.approx(np.sqrt(0.5 / 10), rel=0.15)
 
 
 def test_an_anatomy_has_flow_only_within_its_volume(vessel):

@@ -44,8 +44,8 @@ def distance_field(value) -> SampledVolume:
 
 def wet(tank: Tank, distance, fluid=WATER, **settings) -> Tank:
     """The tank with an organ, seen through fluid; ``settings`` are those of ``Propagation``."""
-    given = dict(contact="organ", contact_gap_mm=GAP_MM, has_fluid=True) | settings
-    sound = Propagation(tank.tissue, distance_field(distance), tank.plane, probe_of(), 0.5, **given)
+    values = dict(contact="organ", contact_gap_mm=GAP_MM, has_fluid=True) | settings
+    sound = Propagation(tank.tissue, distance_field(distance), tank.plane, probe_of(), 0.5, **values)
     sound.surface, sound.fluid = MIRROR, fluid
     tank.bmode = BMode(sound, probe_of())
     return tank

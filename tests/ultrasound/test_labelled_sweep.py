@@ -54,11 +54,11 @@ def status_of(*arguments) -> int:
 
 def refused(*arguments) -> str:
     """The one line with which a command is refused."""
-    told = io.StringIO()
-    with redirect_stderr(told):
+    output = io.StringIO()
+    with redirect_stderr(output):
         status = status_of(*arguments)
-    lines = [line for line in told.getvalue().strip().splitlines() if "image/s" not in line]
-    assert status == 2 and len(lines) == 1 and lines[0].startswith("nephron: "), told.getvalue()
+    lines = [line for line in output.getvalue().strip().splitlines() if "image/s" not in line]
+    assert status == 2 and len(lines) == 1 and lines[0].startswith("nephron: "), output.getvalue()
     return lines[0]
 
 
@@ -83,8 +83,8 @@ class Recording(SweepRecorder):
     def __init__(self, anatomy: SimpleNamespace) -> None:
         super().__init__(anatomy, Notices())
 
-    def add(self, *given) -> str:
-        super().add(*given)
+    def add(self, *frame) -> str:
+        super().add(*frame)
         return "".join(self.notices.present())
 
     def toggle(self, out: Path) -> str:
@@ -300,8 +300,8 @@ def swept(tmp_path_factory) -> Path:
     places = np.reshape(places, (-1, 3))
     inside = [signed_distance(part.vertices, part.faces, places)[0] < 0 for part in (organ, tumour)]
     marks = np.where(inside[1], PixelLabel.TUMOUR, inside[0]).astype(np.uint8).reshape(-1, 64, 64)
-    for k, (pose, each) in enumerate(zip(way, marks, strict=True)):
-        sweep.add(40 + 80 * each, each, probe, pose, k / 10)
+    for k, (pose, labels) in enumerate(zip(way, marks, strict=True)):
+        sweep.add(40 + 80 * labels, labels, probe, pose, k / 10)
     sweep.close()
     return folder / "over.igs.mha"
 
@@ -313,8 +313,8 @@ def test_a_sweep_is_described_by_its_steps_and_speeds():
     sweep = Sweep(np.zeros((5, 2, 2), np.uint8), frames, {})
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, :3, 3] = [[0, 0, 9], [1, -2, 11], [9, 6, 7], [9, 3, 3]]
-    found = _describe(sweep, ImagePoses(np.array([0, 1, 3, 4]), poses))
-    assert found == dict(
+    described = _describe(sweep, ImagePoses(np.array([0, 1, 3, 4]), poses))
+    assert described == dict(
         frames=5,
         used=4,
         way_mm=20.0,
@@ -326,7 +326,7 @@ def test_a_sweep_is_described_by_its_steps_and_speeds():
     part = dict(dice=0.9123, hd95_mm=1.254, volume_percent=-3.46, centroid_mm=0.567)
     organ = dict(scanned=0.234, whole=None, scanned_part=part)
     tumour = dict(scanned=0.876, whole=None, scanned_part=dict.fromkeys(part))
-    report = found | dict(
+    report = described | dict(
         shape=[30, 40, 50],
         spacing_mm=0.5,
         method="smooth",
@@ -372,9 +372,9 @@ def test_reconstruct_compares_no_sweep_with_an_organ_that_it_does_not_show(swept
     (tmp_path / "scene.toml").write_text('[anatomy]\norgan = "organ.stl"\n')
     scene = "--scene", tmp_path
     assert status_of("reconstruct", swept, *scene, "--spacing-mm", "2", "--out", tmp_path) == 0
-    report, told = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out
-    assert report["agreement"] == {} and "Dice" not in told
-    assert re.search(r"the sweep covers 0\.[0-9] % of this organ", told)
+    report, output = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out
+    assert report["agreement"] == {} and "Dice" not in output
+    assert re.search(r"the sweep covers 0\.[0-9] % of this organ", output)
 
 
 def test_reconstruct_refuses_in_one_line(swept, tmp_path, monkeypatch):
@@ -442,8 +442,8 @@ def test_scan_leaves_a_sweep_at_the_poses_of_its_file(tmp_path):
     marks = read_ground_truth(tmp_path / "out/sweep.igs.mha")
     probe, rows = load_probe("drop-in"), sweep.images.shape[1]
     for frame, pose in enumerate(way):
-        for each in (sweep, marks):
-            assert each.transform("Probe", "Reference", frame) == pytest.approx(pose, abs=1e-9)
+        for file in (sweep, marks):
+            assert file.transform("Probe", "Reference", frame) == pytest.approx(pose, abs=1e-9)
         at = sweep.transform("Image", "Reference", frame)
         assert at == pytest.approx(pose @ probe.image_to_probe(rows, rows), abs=1e-9)
     assert np.diff(sweep.times_s) == pytest.approx(1 / 30) and sweep.images.std() > 10

@@ -68,7 +68,7 @@ def test_other_images_and_the_given_ones_stay_as_they_are():
     persistence = Persistence()
     for number in (1, 2):
         grey, ct = images_of(number).by_name[B_MODE], images_of(-number % 7, name=CT).by_name[CT]
-        given = replace(images_of(number), by_name={B_MODE: grey.copy(), CT: ct})
-        mixed = persistence.mixed(given, SHARE)
+        images = replace(images_of(number), by_name={B_MODE: grey.copy(), CT: ct})
+        mixed = persistence.mixed(images, SHARE)
         assert list(mixed.by_name) == [B_MODE, CT] and mixed.by_name[CT] is ct
-        assert np.array_equal(given.by_name[B_MODE], grey) and mixed.location == given.location
+        assert np.array_equal(images.by_name[B_MODE], grey) and mixed.location == images.location

@@ -322,8 +322,8 @@ def test_a_target_is_drawn_where_it_is(tank, geometry, target):
     tank.look(probe_of(geometry))
     amplitude = 10 ** (tank.picture / 255.0 * 60 / 20) - 1
     u, v = pixel_places(geometry)
-    found = [np.average(u, weights=amplitude), np.average(v, weights=amplitude)]
-    assert found == pytest.approx(target, abs=max(u[0, 1] - u[0, 0], v[1, 0] - v[0, 0]) / 2)
+    centre = [np.average(u, weights=amplitude), np.average(v, weights=amplitude)]
+    assert centre == pytest.approx(target, abs=max(u[0, 1] - u[0, 0], v[1, 0] - v[0, 0]) / 2)
 
 
 def test_gain_and_its_course_over_depth_are_added(tank):

@@ -64,9 +64,9 @@ def test_places_sampled_together_have_the_values_that_they_have_alone(device, sh
             for lane in ti.static(range(LANES)):
                 x[lane], y[lane], z[lane] = places[i, lane, 0], places[i, lane, 1], places[i, lane, 2]
                 alone[i, lane] = volume.sample(tm.vec3(x[lane], y[lane], z[lane]))
-            found = volume.sample_lanes(x, y, z, True)
+            values_of_lanes = volume.sample_lanes(x, y, z, True)
             for lane in ti.static(range(LANES)):
-                together[i, lane] = found[lane]
+                together[i, lane] = values_of_lanes[lane]
 
     ask(volume, places, together, alone)
     assert 0.1 < (alone == -7.0).mean() < 0.9 and np.abs(together - alone).max() < 1e-5
@@ -80,22 +80,22 @@ def test_the_gradient_of_a_volume_is_that_over_a_voxel_to_each_side_and_its_slop
     last = np.array([5.0, 4.0, 3.0])
     inside = np.random.default_rng(5).uniform(-0.45, last + 0.45, (300, 3))
     points = np.vstack([inside, last + 0.6]) @ np.linalg.inv(index_from_mm[:3, :3]).T
-    given, gradient, slope = (zeros(len(points), 3, within=1) for _ in range(3))
-    fill((given, points))
+    place, gradient, slope = (zeros(len(points), 3, within=1) for _ in range(3))
+    fill((place, points))
 
     @kernel
     def ask(
         volume: ti.template(),
         first_part: ti.template(),
-        given: ti.template(),
+        place: ti.template(),
         gradient: ti.template(),
         slope: ti.template(),
     ):
-        for i in range(given.shape[0]):
-            gradient[i] = volume.gradient(given[i])
-            slope[i] = first_part.slope(given[i])
+        for i in range(place.shape[0]):
+            gradient[i] = volume.gradient(place[i])
+            slope[i] = first_part.slope(place[i])
 
-    ask(volume, first_part, given, gradient, slope)
+    ask(volume, first_part, place, gradient, slope)
     value = RegularGridInterpolator([np.arange(n) for n in (6, 5, 4)], voxels[..., 0].astype(float))
     middle, along = np.clip(inside, 0, last), np.empty((300, 3))
     for axis in range(3):
@@ -137,9 +137,9 @@ def test_a_volume_of_one_slice_is_sampled_within_its_thickness(device):
 
 def test_distance_volume_is_signed(device, ball):
     volume = distance_volume(trimesh.creation.icosphere(subdivisions=4, radius=10.0), 1.0)
-    found, axis = array_of(volume.voxels).reshape(volume.count), np.arange(volume.count[0]) - 16.0
+    distance, axis = array_of(volume.voxels).reshape(volume.count), np.arange(volume.count[0]) - 16.0
     expected = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij")), axis=0) - 10.0
     near = np.abs(expected) < 4.5
     # The facets lie up to 0.03 mm within the ball.
-    assert np.abs(found - expected)[near].max() < 0.04
-    assert (found[expected < -4.5] < -4.5).all() and (found[expected > 4.5] > 4.4).all()
+    assert np.abs(distance - expected)[near].max() < 0.04
+    assert (distance[expected < -4.5] < -4.5).all() and (distance[expected > 4.5] > 4.4).all()

@@ -59,7 +59,7 @@ def frame_of(**fields) -> Sweep:
 
 def tracked(**matrices) -> dict[str, str]:
     """Fields of a frame whose transforms are OK."""
-    return {key: text for each in matrices.items() for key, text in transform_fields(*each).items()}
+    return {key: text for named in matrices.items() for key, text in transform_fields(*named).items()}
 
 
 @pytest.mark.parametrize("sample", SAMPLES)
@@ -330,5 +330,5 @@ def test_whatever_stands_in_a_sweep_comes_back(tmp_path_factory, frames, data):
     write_sweep(path, Sweep(images, frames, {"Note": "a"}))
     again = read_sweep(path)
     assert again.frames == frames
-    assert [list(each) for each in again.frames] == [list(each) for each in frames]
+    assert [list(fields) for fields in again.frames] == [list(fields) for fields in frames]
     assert np.array_equal(again.images, images)
