@@ -7,7 +7,8 @@ import taichi as ti
 import taichi.math as tm
 import trimesh
 from conftest import rotation_about
-from test_solver import on_floor, position, solver_of
+from lattice_tissue import position
+from test_solver import on_floor, solver_of
 
 from sim.fields import array_of, fill, zeros
 from sim.kernels import kernel

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import taichi as ti
 import trimesh
+from lattice_tissue import position
 from test_particle_contact import begin
-from test_solver import position, solver_of
+from test_solver import solver_of
 
 from sim.fields import array_of, fill
 from sim.kernels import kernel

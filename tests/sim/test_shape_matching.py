@@ -7,7 +7,7 @@ import pytest
 import taichi as ti
 from conftest import rotation_about
 from particle_tissue import tissue_of
-from test_solver import on_floor, solver_of
+from test_solver import solver_of
 
 from sim.body import BodyState, ParticleBody
 from sim.fields import array_of, fill
@@ -124,24 +124,6 @@ def test_patches_follow_their_particles_after_contact(one_device, block, relaxat
         assert np.abs(moment[p][:3, :3] - wanted).max() < 7 * patches.sizes[p] * ROUNDING_MM
 
 
-@kernel
-def push_out(model: ti.template(), factor: float):
-    model.contacts.find()
-    model.gather()
-    model.project(0.0, factor, 0.0)
-
-
-@pytest.mark.parametrize("factor, left", [(0.4, 0.6), (1.0, 0.0), (1.7, 0.0)])
-def test_over_relaxation_does_not_move_particles_beyond_the_surface(kept, block, factor, left):
-    model = kept(on_floor, block, -7.5, 0.0).model
-    body = model.body
-    push_out(model, factor)
-    depth = array_of(body.contact_radius) - 7.5 - body.rest_points[:, 2]
-    moved = array_of(model.predicted)[:, 2] - body.rest_points[:, 2]
-    assert (depth > 0.4).sum() > 20
-    assert np.abs(moved - (1 - left) * np.maximum(depth, 0.0)).max() < ROUNDING_MM
-
-
 def test_collapsed_flat_and_inverted_bodies_come_back_to_finite_shapes(kept, block):
     body, model, _ = moved_body(kept, block, "local")
     rest = body.rest_points
@@ -156,17 +138,6 @@ def test_collapsed_flat_and_inverted_bodies_come_back_to_finite_shapes(kept, blo
         assert np.isfinite(array_of(body.predicted)).all()
         turned = array_of(model.frame)[:, :3, :3].astype(float)
         assert np.abs(np.linalg.det(turned) - 1).max() < 1e-5
-
-
-def test_frames_do_not_depend_on_those_before(kept, block):
-    body, model, x = moved_body(kept, block, "local")
-    first = array_of(model.frame)
-    body.restore(BodyState(-x[::-1].astype(np.float32), np.zeros(x.shape, np.float32)))
-    model.update_frames()
-    assert not np.array_equal(array_of(model.frame), first)
-    body.restore(BodyState(x.astype(np.float32), np.zeros(x.shape, np.float32)))
-    model.update_frames()
-    assert np.array_equal(array_of(model.frame), first)
 
 
 def test_patches_have_each_membership_of_the_clusters(block):

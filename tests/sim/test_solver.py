@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from lattice_tissue import position
 from particle_tissue import tissue_of
 
 from sim.body import ParticleBody
@@ -45,10 +46,6 @@ def on_floor(mesh, height_mm: float, friction: float = 0.35) -> Solver:
 def in_bowl(mesh) -> Solver:
     """A body in ``bowl``, which it slides in without friction."""
     return solver_of(mesh, [bowl()], friction=0.0)
-
-
-def position(solver: Solver) -> np.ndarray:
-    return array_of(solver.body.position).astype(np.float64)
 
 
 @pytest.mark.parametrize("damping", [0.0, 12.0])

@@ -5,8 +5,9 @@ import hashlib
 import numpy as np
 import taichi as ti
 from coarse_patient import coarse_patient
+from lattice_tissue import position
 from test_rehearsal import LOOK
-from test_solver import position, solver_of
+from test_solver import solver_of
 
 from rehearsal.rehearsal import script_length_s
 from sim import embedding, neo_hookean

@@ -10,6 +10,7 @@ import pytest
 import taichi as ti
 import trimesh
 from conftest import rotation_about
+from lattice_tissue import lifted
 
 from rehearsal.build_solver import build_solver, embedding_cell_mm, static_shape, step_settings
 from rehearsal.configuration import PRESETS
@@ -79,12 +80,6 @@ class Subject:
 
 def tissue_of(model: str, **values) -> TissueSection:
     return TISSUES[model].model_validate({"model": model, **values})
-
-
-def lifted(z: float) -> np.ndarray:
-    pose = np.eye(4)
-    pose[2, 3] = z
-    return pose
 
 
 def ball_of(model: str, on_table: bool, serial: bool | None = None) -> Subject:

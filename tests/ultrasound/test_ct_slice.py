@@ -204,17 +204,24 @@ def test_the_pixel_near_a_place_is_the_nearest(one_device):
     assert np.array_equal(pixels[:, 1], np.abs(places[:, :1] - u).argmin(axis=1))
 
 
+def edges_of(embedding: Embedding) -> tuple[np.ndarray, np.ndarray]:
+    """Last corners (t, 3) of the tetrahedra, and the edges (t, 3, 3) from there to the others, as columns."""
+    corners = array_of(embedding.skin.vertices).astype(float)[array_of(embedding.tetrahedron)]
+    return corners[:, 3], np.moveaxis(corners[:, :3] - corners[:, 3:], 1, 2)
+
+
+def least_weights(inverse: np.ndarray, corner: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Least barycentric coordinate (t,) of a place in each tetrahedron: negative where it is outside."""
+    weights = np.einsum("tij,tj->ti", inverse, place - corner)
+    return np.minimum(weights.min(axis=1), 1 - weights.sum(axis=1))
+
+
 def test_every_pixel_finds_the_tetrahedron_that_holds_it(kept, ball):
     cut, plane, _, embedding = sliced(kept, ball, ramp_image, bent)
-    vertices = array_of(embedding.skin.vertices).astype(float)
-    corners = vertices[array_of(embedding.tetrahedron)]
-    edges = np.moveaxis(corners[:, :3] - corners[:, 3:], 1, 2)
-    inverse = np.linalg.inv(edges)
-    owner = array_of(cut.plane.owner)
-    points = pixel_points(plane, 96)
+    corner, edges = edges_of(embedding)
+    inverse, points, owner = np.linalg.inv(edges), pixel_points(plane, 96), array_of(cut.plane.owner)
     for row, column in np.random.default_rng(5).integers(0, 96, (300, 2)):
-        weights = np.einsum("tij,tj->ti", inverse, points[row, column] - corners[:, 3])
-        least = np.minimum(weights.min(axis=1), 1 - weights.sum(axis=1))
+        least = least_weights(inverse, corner, points[row, column])
         if owner[row, column] == embedding.count:
             assert least.max() < 1e-4
         else:
@@ -265,8 +272,7 @@ def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(kept
         return x - np.column_stack([0 * x[:, 0], 0 * x[:, 0], 10.0 * (x[:, 2] > 1.0)])
 
     cut, plane, _, embedding = sliced(kept, ball, ramp_image, folded)
-    corners = array_of(embedding.skin.vertices).astype(float)[array_of(embedding.tetrahedron)]
-    edges = np.moveaxis(corners[:, :3] - corners[:, 3:], 1, 2)
+    corner, edges = edges_of(embedding)
     # What is turned inside out is not taken: the tissue that it was squeezed into is there too.
     solid = np.linalg.det(edges) < -0.1
     inverse = np.zeros_like(edges)
@@ -274,8 +280,7 @@ def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(kept
     points, owner = pixel_points(plane, 96), array_of(cut.plane.owner)
     overlaps = 0
     for row, column in np.argwhere(owner != embedding.count)[::3]:
-        weights = np.einsum("tij,tj->ti", inverse, points[row, column] - corners[:, 3])
-        least = np.minimum(weights.min(axis=1), 1 - weights.sum(axis=1))
+        least = least_weights(inverse, corner, points[row, column])
         holds = np.flatnonzero(solid & (least > 1e-3))
         overlaps += len(holds) > 1
         assert len(holds) == 0 or owner[row, column] <= holds[0]

@@ -72,6 +72,16 @@ def test_places_sampled_together_have_the_values_that_they_have_alone(device, sh
     assert 0.1 < (alone == -7.0).mean() < 0.9 and np.abs(together - alone).max() < 1e-5
 
 
+def differences(value: RegularGridInterpolator, middle, low, high) -> np.ndarray:
+    """Of values at middles (n, 3), of which one coordinate in turn is low or high, over what is between."""
+    columns = []
+    for axis in range(3):
+        before, behind = middle.copy(), middle.copy()
+        before[:, axis], behind[:, axis] = low[:, axis], high[:, axis]
+        columns.append((value(behind) - value(before)) / (high - low)[:, axis])
+    return np.stack(columns, axis=1)
+
+
 def test_the_gradient_of_a_volume_is_that_over_a_voxel_to_each_side_and_its_slope_that_within_a_cell(device):
     voxels = np.random.default_rng(4).normal(size=(6, 5, 4, 3)).astype(np.float32)
     index_from_mm = np.eye(4)
@@ -97,24 +107,14 @@ def test_the_gradient_of_a_volume_is_that_over_a_voxel_to_each_side_and_its_slop
 
     ask(volume, first_part, place, gradient, slope)
     value = RegularGridInterpolator([np.arange(n) for n in (6, 5, 4)], voxels[..., 0].astype(float))
-    middle, along = np.clip(inside, 0, last), np.empty((300, 3))
-    for axis in range(3):
-        low, high = middle.copy(), middle.copy()
-        low[:, axis], high[:, axis] = (
-            np.maximum(inside[:, axis] - 1, 0),
-            np.minimum(inside[:, axis] + 1, last[axis]),
-        )
-        along[:, axis] = (value(high) - value(low)) / (high - low)[:, axis]
+    middle = np.clip(inside, 0, last)
+    along = differences(value, middle, np.maximum(inside - 1, 0), np.minimum(inside + 1, last))
     # Float32 of values of 4, in voxels of 0.7 mm at least.
     assert array_of(gradient)[:300] == pytest.approx(along @ index_from_mm[:3, :3], abs=3e-5)
     # A trilinear value is linear along each axis of its cell: so its slope is the difference of the cell's
     # two sides.
-    middle, within = np.clip(inside, 0, last), np.empty((300, 3))
     cell = np.minimum(np.floor(middle), last - 1)
-    for axis in range(3):
-        low, high = middle.copy(), middle.copy()
-        low[:, axis], high[:, axis] = cell[:, axis], cell[:, axis] + 1
-        within[:, axis] = value(high) - value(low)
+    within = differences(value, middle, cell, cell + 1)
     assert array_of(slope)[:300] == pytest.approx(within @ index_from_mm[:3, :3], abs=3e-5)
     assert (array_of(gradient)[300] == 0).all() and (array_of(slope)[300] == 0).all()
 
