@@ -56,12 +56,6 @@ class Owner:
             into[which] = into[which] + self.first.values[which]
 
 
-class Other(Plain):
-    @ti.func
-    def added(self):
-        return 100.0
-
-
 def compiled(bound) -> int:
     return len(bound.__func__._compiled)
 
@@ -101,13 +95,6 @@ def test_a_flag_that_changes_is_another_kernel(device):
     assert np.array_equal(array_of(thing.values), [-1.25, -1.25]) and compiled(thing.add) == count + 1
 
 
-def test_objects_of_another_class_have_a_kernel_of_their_own(device):
-    plain, other = Plain(np.zeros(1)), Other(np.zeros(1))
-    plain.add(0.0)
-    other.add(0.0)
-    assert (array_of(plain.values)[0], array_of(other.values)[0]) == (0.25, 100.0)
-
-
 def test_parts_in_lists_and_fields_and_numbers_as_parameters(device):
     parts = [Plain(np.array([5.0, 6.0]), 1.0), Plain(np.zeros(2), 2.0)]
     owner, into, others = Owner(parts), zeros(2), zeros(3)
@@ -143,44 +130,6 @@ def test_a_value_that_is_neither_number_nor_field_is_named(device):
 
     with pytest.raises(Exception, match="table"):
         Wrong().copy()
-
-
-class Elements:
-    """Vectors and matrices, whole and in part."""
-
-    def __init__(self, vectors: np.ndarray, matrices: np.ndarray) -> None:
-        self.vector, self.matrix = field_of(vectors, 1), field_of(matrices, 2)
-        self.count, self.out = len(vectors), zeros(*vectors.shape, within=1)
-
-    @kernel
-    def change(self):
-        for i in range(self.count):
-            self.out[i] = self.matrix[i] @ self.vector[i]
-            self.vector[i].y = 5.0
-            self.vector[i][2] = 6.0 + i
-            for k in range(3):
-                self.vector[i][0] = self.vector[i][0] + self.vector[i][k]
-            self.matrix[i] = 2.0 * self.matrix[i]
-            self.matrix[i][1, 0] = -1.0
-            self.matrix[i][2, :] = self.vector[i]
-            self.out[i] += self.vector[i]
-
-
-def test_elements_are_read_and_written_whole_and_in_part(device):
-    random = np.random.default_rng(0)
-    vectors, matrices = random.integers(-9, 9, (4, 3)).astype(float), random.integers(-9, 9, (4, 3, 3)) * 1.0
-    thing = Elements(vectors, matrices)
-    thing.change()
-    product = np.einsum("nij,nj->ni", matrices, vectors)
-    vectors[:, 1], vectors[:, 2] = 5.0, 6.0 + np.arange(4)
-    for k in range(3):
-        vectors[:, 0] += vectors[:, k]
-    matrices *= 2
-    matrices[:, 1, 0], matrices[:, 2] = -1.0, vectors
-    assert np.array_equal(array_of(thing.vector), vectors) and np.array_equal(
-        array_of(thing.matrix), matrices
-    )
-    assert np.array_equal(array_of(thing.out), product + vectors)
 
 
 class Grid:

@@ -10,8 +10,6 @@ from sim.lattice import (
     ERSATZ,
     EXTRAPOLATED_CELLS,
     fill_with_cells,
-    shape_functions,
-    shape_gradients,
     surface_points,
 )
 from sim.sampling import SamplingError
@@ -83,24 +81,6 @@ def test_cells_are_cubes_and_cover_the_organ(mesh):
     place = np.floor((points - lattice.low_mm) / 3.0).astype(int)
     assert len(points) > 500 and (lattice.index_of[tuple(place.T)] >= 0).all()
     assert len(np.unique(lattice.cells)) == len(lattice.nodes)
-
-
-def test_nodes_of_one_colour_share_no_cell(mesh):
-    lattice = fill_with_cells(mesh, 3.0)
-    assert lattice.colour_start[0] == 0 and lattice.colour_start[8] == len(lattice.nodes)
-    colour = np.searchsorted(lattice.colour_start, lattice.cells, side="right") - 1
-    assert (np.sort(colour, axis=1) == np.arange(8)).all()
-
-
-def test_shape_functions_are_one_at_their_corner_and_sum_to_one():
-    assert (shape_functions(CORNERS.astype(float)) == np.eye(8)).all()
-    at = np.random.default_rng(2).uniform(-1, 2, (200, 3))
-    assert np.abs(shape_functions(at).sum(axis=1) - 1).max() < 1e-13
-    ahead, back = at[:, None] + 1e-4 * np.eye(3), at[:, None] - 1e-4 * np.eye(3)
-    slope = (shape_functions(ahead.reshape(-1, 3)) - shape_functions(back.reshape(-1, 3))) / 2e-4
-    # Along one edge they are linear, so central differences are exact but for rounding, 1e-16 of up to 8 /
-    # 2e-4.
-    assert np.abs(slope.reshape(200, 3, 8).transpose(0, 2, 1) - shape_gradients(at)).max() < 1e-10
 
 
 def test_linear_fields_have_exactly_their_gradient_and_no_hourglass(mesh):
