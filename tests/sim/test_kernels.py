@@ -56,6 +56,12 @@ class Owner:
             into[which] = into[which] + self.first.values[which]
 
 
+class Other(Plain):
+    @ti.func
+    def added(self):
+        return 100.0
+
+
 def compiled(bound) -> int:
     return len(bound.__func__._compiled)
 
@@ -93,6 +99,13 @@ def test_a_flag_that_changes_is_another_kernel(device):
     thing.turns = False
     thing.add(0.0)
     assert np.array_equal(array_of(thing.values), [-1.25, -1.25]) and compiled(thing.add) == count + 1
+
+
+def test_objects_of_another_class_have_a_kernel_of_their_own(device):
+    plain, other = Plain(np.zeros(1)), Other(np.zeros(1))
+    plain.add(0.0)
+    other.add(0.0)
+    assert (array_of(plain.values)[0], array_of(other.values)[0]) == (0.25, 100.0)
 
 
 def test_parts_in_lists_and_fields_and_numbers_as_parameters(device):
