@@ -51,8 +51,8 @@ def test_images_share_the_panel_without_overlap_in_the_shape_of_the_image_plane(
         taken[box.slices] += 1
         assert box.left >= LAYOUT.panel.left + RULER_WIDTH and box.right <= LAYOUT.panel.right
         assert box.top >= HEADER_HEIGHT and box.bottom <= LAYOUT.panel.bottom
-        # Each side is rounded to whole pixels: half a pixel on either; of two, to the smaller box.
-        assert abs(box.width * depth_mm - box.height * width_mm) <= 0.5 * count * (width_mm + depth_mm)
+        # Each side is rounded to whole pixels: half a pixel on either.
+        assert abs(box.width * depth_mm - box.height * width_mm) <= 0.5 * (width_mm + depth_mm)
     assert taken.max() == 1 and {box[2:] for box in boxes} == {boxes[0][2:]}
     assert count == 1 or (boxes[0].left == boxes[1].left) == (width_mm > depth_mm)
 
