@@ -81,17 +81,6 @@ def test_a_plane_shows_a_slab_of_its_thickness(organ, axes, thickness):
     if np.linalg.norm(steps) <= VOXEL_MM:
         assert organ.seen[inside].all()
     assert organ.seen[inside].mean() > 0.97
-    if np.array_equal(axes, UPRIGHT):
-        return  # which has whole layers of voxels
-    # So of the ball between a slab and one thicker by a voxel's extent less a part's step; counting is off by
-    # 3 %.
-    height, inner = np.dot(normal, origin), (aside < 0) & organ.targets["organ"]
-    share = (
-        inner[np.abs(off) < thickness / 2].sum() / organ.targets["organ"][np.abs(off) < thickness / 2].sum()
-    )
-    seen = (organ.seen & inner).sum() * VOXEL_MM**3
-    assert 0.97 * slab(thickness, height) * share < seen
-    assert seen < 1.03 * slab(thickness + 2 * reach - thickness / parts, height) * share
 
 
 def slab(thickness: float, height: float) -> float:

@@ -344,14 +344,14 @@ def test_a_sweep_is_described_by_its_steps_and_speeds():
 
 def test_reconstruct_makes_a_volume_and_compares_it(swept, tmp_path, capsys):
     scene = "--scene", EMBEDDED
-    assert status_of("reconstruct", swept, *scene, "--spacing-mm", "1", "--out", tmp_path / "out") == 0
+    assert status_of("reconstruct", swept, *scene, "--spacing-mm", "1.5", "--out", tmp_path / "out") == 0
     report = json.loads((tmp_path / "out" / "report.json").read_text(), parse_constant=pytest.fail)
     assert (report["frames"], report["used"], report["method"]) == (14, 14, "smooth")
     assert report["version"] == VERSION
     assert report["way_mm"] == pytest.approx(13 * 1.5) and report["between_max_mm"] == pytest.approx(1.5)
     assert report["speed_median_mm_s"] == report["speed_max_mm_s"] == pytest.approx(15.0)
     # Two voxels, which is more than pictures are apart.
-    assert report["reach_mm"] == 2.0 and report["undo_compression"] is False
+    assert report["reach_mm"] == 3.0 and report["undo_compression"] is False
     organ, tumour = report["agreement"]["organ"], report["agreement"]["tumour"]
     assert organ["scanned"] < 0.3 < 0.5 < tumour["scanned"] < 1
     # As balls of the same volume: an outline that is off by a quarter of a voxel on average.
