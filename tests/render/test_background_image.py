@@ -173,8 +173,8 @@ def test_the_font_is_as_large_as_fits():
     rows = [("Space", "what it is for"), ("W / S", "push it in, lift it")]
     size = fitting_size(rows, 150, 30)
     lengths = [
-        font(each).getlength("Space") + font(each).getlength("push it in, lift it")
-        for each in (size, size + 1)
+        font(points).getlength("Space") + font(points).getlength("push it in, lift it")
+        for points in (size, size + 1)
     ]
     assert lengths[0] <= 150 < lengths[1]
     assert fitting_size(rows, 900, 15) == 15
@@ -236,12 +236,12 @@ def test_what_to_do_stands_whole_under_a_note(size, hint):
     ],
 )
 def test_the_calipers_figure_stands_at_its_line(points):
-    bare, told = (
+    bare, labelled = (
         composed(BackgroundImage(LAYOUT), caliper_mm=points, caliper=figure)
         for figure in ("", "24.0 mm\nat rest 25.1 mm")
     )
     for box in image_boxes(LAYOUT):
-        changed = np.argwhere((bare != told)[box.slices].any(axis=-1))
+        changed = np.argwhere((bare != labelled)[box.slices].any(axis=-1))
         assert len(changed) > 100
         middle = (np.mean(points, axis=0) + [8.0, 0.0])[::-1] * box.height / 40.0
         # Beside the line, so no farther from its middle than half of the figure and a little more.
@@ -249,11 +249,11 @@ def test_the_calipers_figure_stands_at_its_line(points):
         # A line down the right half has it on its left, one down the left half on its right.
         assert points[0][0] != points[1][0] or (changed[:, 1].mean() - middle[1]) * points[0][0] < 0
         # The line stays whole.
-        assert len(coloured(told, box, CALIPER)) > len(coloured(bare, box, CALIPER))
+        assert len(coloured(labelled, box, CALIPER)) > len(coloured(bare, box, CALIPER))
     outside = np.ones(bare.shape[:2], bool)
     for box in image_boxes(LAYOUT):
         outside[box.slices] = False
-    assert np.array_equal(bare[outside], told[outside])
+    assert np.array_equal(bare[outside], labelled[outside])
 
 
 def test_outlines_have_a_legend_under_the_picture():
@@ -293,10 +293,12 @@ def test_all_readouts_of_a_window_are_shown(size):
 @each_size
 @pytest.mark.parametrize("help_key", ["H", "Backspace"])
 def test_clock_and_pace_stand_between_title_and_help_in_every_window(size, help_key):
-    layout, told = WindowLayout(*size), {"clock": "1234.5 s", "title": "A long title of a patient " * 5}
+    layout, texts = WindowLayout(*size), {"clock": "1234.5 s", "title": "A long title of a patient " * 5}
     page = BackgroundImage(layout, replace(KEYS, of={**KEYS.of, "help": help_key}))
     box = clock_box(layout, help_key)
-    bare, real, slow = (composed(page, **told | more) for more in ({"clock": ""}, {}, {"pace": "0.2 x real"}))
+    bare, real, slow = (
+        composed(page, **texts | more) for more in ({"clock": ""}, {}, {"pace": "0.2 x real"})
+    )
     assert set(np.unique(bare[box.slices])) == {17, 20, 24}
     for before, after, is_caution in ((bare, real, False), (real, slow, True)):
         changed = after[(before != after).any(axis=2)].astype(int)

@@ -58,8 +58,8 @@ def test_a_block_covers_the_cells_that_it_covers(block):
 def test_a_hole_is_not_covered(ball):
     hole = trimesh.creation.icosphere(subdivisions=3, radius=6.0)
     segments = [
-        oriented_section(each.vertices, faces, plane((0, 1, 0)))
-        for each, faces in ((ball, ball.faces), (hole, hole.faces[:, ::-1]))
+        oriented_section(mesh.vertices, faces, plane((0, 1, 0)))
+        for mesh, faces in ((ball, ball.faces), (hole, hole.faces[:, ::-1]))
     ]
     raster = Raster.around(segments, 101)
     area = raster.covered(np.concatenate(segments)).sum() * raster.width**2
@@ -109,8 +109,8 @@ def test_the_face_lies_on_the_plane_in_the_colours_of_what_it_cuts(device, ball,
     monkeypatch.setattr(cut_face, "CELLS", 60)
     kernel = trimesh.creation.icosphere(subdivisions=2, radius=4.0).apply_translation([5.0, 0, 0])
     organ, tumour = (
-        SimpleNamespace(vertices=field_of(each.vertices, 1), faces=each.faces, base=colour)
-        for each, colour in ((ball, (0.5, 0.1, 0.1)), (kernel, (1.0, 0.8, 0.0)))
+        SimpleNamespace(vertices=field_of(mesh.vertices, 1), faces=mesh.faces, base=colour)
+        for mesh, colour in ((ball, (0.5, 0.1, 0.1)), (kernel, (1.0, 0.8, 0.0)))
     )
     pose, scene = plane((0, 1, 0), (0, 0, 1), 20.0), Handed()
     cut_face.CutFace().draw(scene, organ, [tumour], pose, np.array([0.0, 300.0, 0.0]))

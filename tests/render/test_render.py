@@ -24,7 +24,7 @@ from render.sliders import boxes_of, draw_sliders
 from render.software_scene import SoftwareScene
 from render.viewer import Geometry, View
 from render.warning_box import warning_image, warning_rect
-from render.window_layout import FULL_SIZE, RULER_WIDTH, WindowLayout
+from render.window_layout import FULL_SIZE, WindowLayout
 from settings import with_values
 from sim.device import start
 from sim.fields import fill, fill_evenly, zeros
@@ -160,19 +160,6 @@ def test_a_sector_fans_out_from_its_arc():
     assert list(transducer_shape.sampled(grey, places, view)) == [0.0, 1.0, 0.0, 0.0]
     frame_points = transducer_shape.image_plane_frame(view)
     assert frame_points.shape == (2 * transducer_shape.FRAME_SIDES, 3) and frame_points[:, 2].min() < -depth
-
-
-@pytest.mark.parametrize(("width_mm", "depth_mm"), [(16.0, 40.0), (40.0, 60.0), (180.0, 128.0)])
-def test_two_pictures_share_the_panel_without_overlap_as_large_as_they_can_be(width_mm, depth_mm):
-    boxes = LAYOUT.image_boxes(2, width_mm, depth_mm)
-    taken = np.zeros((720, 1280), int)
-    for box in boxes:
-        taken[box.slices] += 1
-        assert box.left >= LAYOUT.panel.left + RULER_WIDTH and box.bottom <= LAYOUT.panel.bottom
-        assert abs(box.width * depth_mm - box.height * width_mm) <= width_mm + depth_mm
-    assert taken.max() == 1 and boxes[0][2:] == boxes[1][2:]
-    stacked = boxes[0].left == boxes[1].left
-    assert stacked == (width_mm > depth_mm)
 
 
 def test_a_place_in_a_picture_is_found_again_under_its_pixel():
@@ -335,12 +322,6 @@ def test_a_3d_view_that_was_drawn_ahead_is_shown_beside_a_newer_image(window):
     assert np.any(moved[scene] != ahead[scene]) and np.array_equal(moved[panel], ahead[panel])
 
 
-def test_two_pictures_of_one_view_are_the_same(window):
-    opened, _, _ = window
-    opened.draw(_view(status="FROZEN"))
-    assert np.array_equal(opened.picture(), opened.picture())
-
-
 class Mouse:
     """Stands for GGUI's window: a mouse at a pixel of a window of 640 x 360, and what was pressed and
     released since the last frame.
@@ -369,8 +350,8 @@ class Mouse:
         return any(key in self.held for key in keys)
 
     def get_events(self, tag: str) -> list[SimpleNamespace]:
-        found, self.events[tag] = self.events[tag], []
-        return found
+        events, self.events[tag] = self.events[tag], []
+        return events
 
 
 @pytest.fixture

@@ -68,11 +68,11 @@ def random_triangles(seed: int, count: int = 25):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_triangles_cover_hide_and_blend_as_in_float64(one_device, seed):
-    given = random_triangles(seed)
-    expected, clear = slowly_drawn(*given)
-    found = drawn(*given)
+    triangles = random_triangles(seed)
+    expected, clear = slowly_drawn(*triangles)
+    image = drawn(*triangles)
     # Each blend rounds to a level, and the next ones pass on less than all of it.
-    assert clear.mean() > 0.9 and np.abs(found - expected)[clear].max() <= 2.5
+    assert clear.mean() > 0.9 and np.abs(image - expected)[clear].max() <= 2.5
     assert np.abs(expected - GREY).max() > 100
 
 
@@ -91,21 +91,21 @@ def test_an_edge_that_two_triangles_share_is_drawn_once(one_device):
         ]
     )
     colours = np.tile([1.0, 1.0, 1.0, 0.5], (len(places), 1))
-    found = drawn(screen, colours, triangles)[..., 0]
+    level = drawn(screen, colours, triangles)[..., 0]
     once = round(GREY + 0.5 * (255 - GREY))
-    assert set(np.unique(found)) == {GREY, once}
+    assert set(np.unique(level)) == {GREY, once}
     # All of what lies well within the border is covered.
-    assert (found[8:34, 8:34] == once).all()
+    assert (level[8:34, 8:34] == once).all()
 
 
 def test_what_is_in_a_box_does_not_depend_on_how_it_is_divided(one_device):
-    given = random_triangles(9)
-    whole = drawn(*given)
+    triangles = random_triangles(9)
+    whole = drawn(*triangles)
     pixels = np.full((WIDTH, HEIGHT, 4), GREY, np.uint8)
     for box in ((0, 13, 0, HEIGHT), (13, WIDTH, 0, 22), (13, WIDTH, 22, HEIGHT)):
-        parts = drawn(*given, box=box, pixels=pixels)
+        parts = drawn(*triangles, box=box, pixels=pixels)
     assert np.array_equal(parts, whole)
-    clipped = drawn(*given, box=(5, 20, 8, 30))
+    clipped = drawn(*triangles, box=(5, 20, 8, 30))
     assert np.array_equal(clipped[5:20, 8:30], whole[5:20, 8:30])
     clipped[5:20, 8:30] = GREY
     assert (clipped == GREY).all()
@@ -157,13 +157,13 @@ def test_a_surface_is_lit_by_lamberts_law(scene, side, two_sided):
         points, np.tile(side * normal, (4, 1)), np.tile(base, (4, 1)), within=1
     )
     scene.mesh(vertices, np.array([0, 1, 2, 0, 2, 3]), normals, colours, two_sided)
-    found = shown(scene)[WIDTH // 2, HEIGHT // 2]
+    colour = shown(scene)[WIDTH // 2, HEIGHT // 2]
     # In the middle of the square the light's direction is nearly that of its corners' mean.
     towards = (light_at - points) / np.linalg.norm(light_at - points, axis=1, keepdims=True)
     lit = side > 0 or two_sided
     cosine = float((towards @ normal).mean()) if lit else 0.0
     expected = 255 * base * (np.array([0.1, 0.2, 0.3]) + cosine * np.array([0.5, 0.4, 0.3]))
-    assert np.abs(found - expected).max() <= 1.0
+    assert np.abs(colour - expected).max() <= 1.0
 
 
 def test_points_are_where_the_camera_projects_them(scene):

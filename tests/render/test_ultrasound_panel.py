@@ -40,13 +40,21 @@ def test_resampled_slice_keeps_its_sides():
     assert np.all(inside[rows + 2 :] == 0) and np.all(inside[:, columns + 2 :] == 0)
 
 
-@pytest.mark.parametrize(("width_mm", "depth_mm"), [(40.0, 60.0), (40.0, 20.0), (40.0, 120.0), (60.0, 45.0)])
-def test_picture_box_has_the_shape_of_the_image_plane_and_stays_in_the_panel(width_mm, depth_mm):
-    box = LAYOUT.image_boxes(1, width_mm, depth_mm)[0]
-    assert box.left >= LAYOUT.panel.left + RULER_WIDTH and box.right <= LAYOUT.panel.right
-    assert box.top >= HEADER_HEIGHT and box.bottom <= LAYOUT.panel.bottom
-    # Each side is rounded to whole pixels: half a pixel on either.
-    assert abs(box.width * depth_mm - box.height * width_mm) <= 0.5 * (width_mm + depth_mm)
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize(
+    ("width_mm", "depth_mm"),
+    [(16.0, 40.0), (40.0, 60.0), (40.0, 20.0), (40.0, 120.0), (60.0, 45.0), (180.0, 128.0)],
+)
+def test_images_share_the_panel_without_overlap_in_the_shape_of_the_image_plane(count, width_mm, depth_mm):
+    boxes, taken = LAYOUT.image_boxes(count, width_mm, depth_mm), np.zeros((720, 1280), int)
+    for box in boxes:
+        taken[box.slices] += 1
+        assert box.left >= LAYOUT.panel.left + RULER_WIDTH and box.right <= LAYOUT.panel.right
+        assert box.top >= HEADER_HEIGHT and box.bottom <= LAYOUT.panel.bottom
+        # Each side is rounded to whole pixels: half a pixel on either.
+        assert abs(box.width * depth_mm - box.height * width_mm) <= 0.5 * (width_mm + depth_mm)
+    assert taken.max() == 1 and {box[2:] for box in boxes} == {boxes[0][2:]}
+    assert count == 1 or (boxes[0].left == boxes[1].left) == (width_mm > depth_mm)
 
 
 def test_the_panel_writes_the_depth_below_the_face_and_the_ends_of_the_scale():
@@ -96,30 +104,19 @@ def test_marker_dot_is_on_the_right():
     assert len(columns) > 0 and np.all(columns > (box.left + box.right) / 2)
 
 
-def test_parts_of_the_window_do_not_overlap():
+def test_panel_title_scene_and_strip_tile_the_window():
     taken = np.zeros((720, 1280), dtype=int)
     for rect in [LAYOUT.panel, LAYOUT.title, LAYOUT.scene, LAYOUT.strip]:
         taken[rect.slices] += 1
     assert np.all(taken == 1)
-    taken[:] = 0
-    for rect in [*LAYOUT.sliders([280.0, 220.0, 130.0]), LAYOUT.readouts]:
-        taken[rect.slices] += 1
-        assert rect.left >= 0 and rect.bottom <= 720 and rect.right <= LAYOUT.panel.left
-    assert taken.max() == 1
 
 
-def test_readouts_and_status_change_the_picture():
-    assert np.any(
-        background_image.readout_image(LAYOUT, {"Step": "9 ms"})
-        != background_image.readout_image(LAYOUT, {"Step": "8 ms"})
-    )
-    composed = background_image.BackgroundImage(LAYOUT)
-    shown = []
+def test_a_status_is_in_its_own_box_and_nothing_of_it_is_left():
+    composed, shown = background_image.BackgroundImage(LAYOUT), []
     for status in ("", "FROZEN", ""):
         composed.compose(ct_view(status=status), np.eye(3))
         shown.append(composed.pixels.transpose(1, 0, 2)[::-1].astype(int))
     changed = np.argwhere(np.any(shown[0] != shown[1], axis=2))
-    # Within its own box, and nothing of it is left.
     low, high = changed.min(axis=0), changed.max(axis=0)
     assert LAYOUT.status.contains(low[1], low[0]) and LAYOUT.status.contains(high[1], high[0])
     assert np.array_equal(shown[0], shown[2])
@@ -135,7 +132,7 @@ PLANNING = "PLANNING   43 %, some 18 min left; Backspace stops"
 )
 def test_a_status_is_as_large_as_it_can_be_in_the_panel(size, status):
     layout = WindowLayout(*size)
-    plain, with_status = (ultrasound_panel.status_image(layout, each).astype(int) for each in ("", status))
+    plain, with_status = (ultrasound_panel.status_image(layout, text).astype(int) for text in ("", status))
     columns = np.flatnonzero(np.any(plain != with_status, axis=(0, 2)))
     room = layout.panel.width - 2 * layout.px(16)
     assert layout.status.width == room

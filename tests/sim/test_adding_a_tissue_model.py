@@ -74,8 +74,8 @@ def test_it_passes_the_tests_of_every_model(laid):
 
 
 def test_its_own_test_passes(added):
-    given = dict(BodyState=BodyState, MassSpring=added, ParticleBody=ParticleBody, RestBody=RestBody)
-    given |= dict(Solver=Solver, StepSettings=StepSettings, np=np, pytest=pytest)
-    exec(TEST, given)
-    (test,) = (function for name, function in given.items() if name.startswith("test_"))
+    names = dict(BodyState=BodyState, MassSpring=added, ParticleBody=ParticleBody, RestBody=RestBody)
+    names |= dict(Solver=Solver, StepSettings=StepSettings, np=np, pytest=pytest)
+    exec(TEST, names)
+    (test,) = (function for name, function in names.items() if name.startswith("test_"))
     test()

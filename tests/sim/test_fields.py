@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from sim.fields import array_of, field_of, fields_of, fill, fill_evenly, zeros
+from sim.fields import array_of, field_of, fill, fill_evenly, zeros
 
 
 @pytest.mark.parametrize("within", [0, 1, 2])
@@ -13,21 +13,14 @@ def test_a_field_holds_an_array(device, kind, within):
     values = np.random.default_rng(0).integers(0, 2 if kind is bool else 100, (5, 4, 3)).astype(kind)
     field = field_of(values, within)
     assert (field.shape, field.element) == (values.shape[: 3 - within], values.shape[3 - within :])
-    found = array_of(field)
-    assert found.dtype == (np.float32 if np.issubdtype(kind, np.floating) else np.int32)
-    assert np.array_equal(found, values)
+    array = array_of(field)
+    assert array.dtype == (np.float32 if np.issubdtype(kind, np.floating) else np.int32)
+    assert np.array_equal(array, values)
 
 
 def test_the_order_in_memory_does_not_matter(device):
     values = np.arange(12.0).reshape(3, 4)
     assert np.array_equal(array_of(field_of(values.T)), values.T)
-
-
-def test_fields_made_together_have_kinds_of_their_own(device):
-    counts = np.random.default_rng(1).integers(-9, 9, 7)
-    whole, broken = fields_of(counts, 0.5 * counts)
-    assert (whole.kind, broken.kind) == (ti.i32, ti.f32)
-    assert np.array_equal(array_of(whole), counts) and np.array_equal(array_of(broken), 0.5 * counts)
 
 
 def test_new_fields_are_zero_and_can_be_filled_evenly(device):

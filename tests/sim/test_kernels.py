@@ -145,44 +145,6 @@ def test_a_value_that_is_neither_number_nor_field_is_named(device):
         Wrong().copy()
 
 
-class Elements:
-    """Vectors and matrices, whole and in part."""
-
-    def __init__(self, vectors: np.ndarray, matrices: np.ndarray) -> None:
-        self.vector, self.matrix = field_of(vectors, 1), field_of(matrices, 2)
-        self.count, self.out = len(vectors), zeros(*vectors.shape, within=1)
-
-    @kernel
-    def change(self):
-        for i in range(self.count):
-            self.out[i] = self.matrix[i] @ self.vector[i]
-            self.vector[i].y = 5.0
-            self.vector[i][2] = 6.0 + i
-            for k in range(3):
-                self.vector[i][0] = self.vector[i][0] + self.vector[i][k]
-            self.matrix[i] = 2.0 * self.matrix[i]
-            self.matrix[i][1, 0] = -1.0
-            self.matrix[i][2, :] = self.vector[i]
-            self.out[i] += self.vector[i]
-
-
-def test_elements_are_read_and_written_whole_and_in_part(device):
-    random = np.random.default_rng(0)
-    vectors, matrices = random.integers(-9, 9, (4, 3)).astype(float), random.integers(-9, 9, (4, 3, 3)) * 1.0
-    thing = Elements(vectors, matrices)
-    thing.change()
-    product = np.einsum("nij,nj->ni", matrices, vectors)
-    vectors[:, 1], vectors[:, 2] = 5.0, 6.0 + np.arange(4)
-    for k in range(3):
-        vectors[:, 0] += vectors[:, k]
-    matrices *= 2
-    matrices[:, 1, 0], matrices[:, 2] = -1.0, vectors
-    assert np.array_equal(array_of(thing.vector), vectors) and np.array_equal(
-        array_of(thing.matrix), matrices
-    )
-    assert np.array_equal(array_of(thing.out), product + vectors)
-
-
 class Grid:
     """A field of two axes, and an array given at the call."""
 
@@ -296,7 +258,7 @@ def test_where_counts_are_compiled_another_count_is_another_kernel(device, monke
     owners = [Counted(3, 0.5), Counted(5, 0.5), Counted(5, 2.0)]
     for owner in owners:
         owner.add()
-    assert [array_of(each.values).tolist() for each in owners] == [[3.5] * 3, [5.5] * 5, [7.0] * 5]
+    assert [array_of(owner.values).tolist() for owner in owners] == [[3.5] * 3, [5.5] * 5, [7.0] * 5]
     owners[1].count = 2
     owners[1].add()
     assert array_of(owners[1].values).tolist() == [11.0] * 2 + [5.5] * 3

@@ -4,15 +4,12 @@ import igl
 import numpy as np
 import pytest
 import trimesh
-from conftest import rotation_about
 
 from sim.lattice import (
     CORNERS,
     ERSATZ,
     EXTRAPOLATED_CELLS,
     fill_with_cells,
-    shape_functions,
-    shape_gradients,
     surface_points,
 )
 from sim.sampling import SamplingError
@@ -62,13 +59,6 @@ def test_tissue_has_the_surfaces_volume_and_centre(mesh, cell_mm):
     assert np.abs(centre - mesh.center_mass).max() < bound / mesh.volume * reach / 4
 
 
-def test_cells_too_large_for_the_organ_are_refused(ball):
-    with pytest.raises(SamplingError, match="choose smaller ones"):
-        fill_with_cells(trimesh.creation.box([30.0, 30.0, 0.5]), 5.0)
-    with pytest.raises(SamplingError, match="fill 0 % of"):
-        fill_with_cells(trimesh.creation.icosphere(subdivisions=2, radius=0.5), 20.0)
-
-
 def test_empty_space_in_cut_cells_has_little_stiffness(mesh):
     lattice = fill_with_cells(mesh, 3.0)
     tissue = lattice.tissue.sum()
@@ -91,24 +81,6 @@ def test_cells_are_cubes_and_cover_the_organ(mesh):
     place = np.floor((points - lattice.low_mm) / 3.0).astype(int)
     assert len(points) > 500 and (lattice.index_of[tuple(place.T)] >= 0).all()
     assert len(np.unique(lattice.cells)) == len(lattice.nodes)
-
-
-def test_nodes_of_one_colour_share_no_cell(mesh):
-    lattice = fill_with_cells(mesh, 3.0)
-    assert lattice.colour_start[0] == 0 and lattice.colour_start[8] == len(lattice.nodes)
-    colour = np.searchsorted(lattice.colour_start, lattice.cells, side="right") - 1
-    assert (np.sort(colour, axis=1) == np.arange(8)).all()
-
-
-def test_shape_functions_are_one_at_their_corner_and_sum_to_one():
-    assert (shape_functions(CORNERS.astype(float)) == np.eye(8)).all()
-    at = np.random.default_rng(2).uniform(-1, 2, (200, 3))
-    assert np.abs(shape_functions(at).sum(axis=1) - 1).max() < 1e-13
-    ahead, back = at[:, None] + 1e-4 * np.eye(3), at[:, None] - 1e-4 * np.eye(3)
-    slope = (shape_functions(ahead.reshape(-1, 3)) - shape_functions(back.reshape(-1, 3))) / 2e-4
-    # Along one edge they are linear, so central differences are exact but for rounding, 1e-16 of up to 8 /
-    # 2e-4.
-    assert np.abs(slope.reshape(200, 3, 8).transpose(0, 2, 1) - shape_gradients(at)).max() < 1e-10
 
 
 def test_linear_fields_have_exactly_their_gradient_and_no_hourglass(mesh):
@@ -212,26 +184,15 @@ def test_pressure_at_the_surface_points_has_the_resultant_of_the_surface(ball):
     assert -(area * normal[:, 2])[below].sum() == pytest.approx(disc, rel=0.03)
 
 
-def test_too_many_cells_are_refused(ball):
-    with pytest.raises(SamplingError, match="choose larger ones"):
-        fill_with_cells(ball, 0.2)
-    with pytest.raises(SamplingError):
-        fill_with_cells(trimesh.creation.box([1000.0, 1000.0, 1000.0]), 0.5)
-
-
-def test_the_same_surface_gives_the_same_lattice(ball):
-    first, second = fill_with_cells(ball, 4.0), fill_with_cells(ball, 4.0)
-    for name in ("nodes", "cells", "gradient", "volume", "hourglass", "tissue"):
-        assert (getattr(first, name) == getattr(second, name)).all()
-
-
-def test_a_rotated_body_gives_the_rotated_lattice(block):
-    # After a quarter turn the cells coincide, because all edges are multiples of a cell.
-    turned = block.copy()
-    turn = np.eye(4)
-    turn[:3, :3] = np.round(rotation_about([0, 0, 1], 90))
-    turned.apply_transform(turn)
-    a, b = fill_with_cells(block, 4.0), fill_with_cells(turned, 4.0)
-    assert len(a.cells) == len(b.cells)
-    assert np.abs(np.sort(a.volume) - np.sort(b.volume)).max() < 1e-9
-    assert np.abs(np.sort(a.tissue, axis=None) - np.sort(b.tissue, axis=None)).max() < 1e-9
+@pytest.mark.parametrize(
+    ("extents", "cell_mm", "words"),
+    [
+        ((30.0, 30.0, 0.5), 5.0, "choose smaller ones"),
+        ((0.8, 0.8, 0.8), 20.0, "fill 0 % of"),
+        ((24.0, 24.0, 24.0), 0.2, "choose larger ones"),
+        ((1000.0, 1000.0, 1000.0), 0.5, "choose larger ones"),
+    ],
+)
+def test_cells_too_large_or_too_many_are_refused(extents, cell_mm, words):
+    with pytest.raises(SamplingError, match=words):
+        fill_with_cells(trimesh.creation.box(extents), cell_mm)

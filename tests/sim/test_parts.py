@@ -9,7 +9,6 @@ from lattice_tissue import DENSITY, Energy, lame_parameters, position, put, sett
 from test_neo_hookean import deformed, forces_of, rounding
 
 from sim.body import Body
-from sim.fields import array_of
 from sim.lattice import fill_block, fill_with_cells
 from sim.material import Material, mixture
 from sim.neo_hookean import NeoHookean
@@ -64,17 +63,19 @@ def test_tissue_outside_the_organ_is_no_part_of_it(organ):
     assert volume == pytest.approx(lens, rel=0.03) and lens < 0.5 * across.volume
 
 
-def test_without_parts_the_lattice_has_no_shares(organ):
-    assert fill_with_cells(organ, 4.0).share.shape[1] == 0
+def test_without_parts_there_are_no_shares(one_device, organ):
+    lattice = fill_with_cells(organ, 4.0)
+    assert lattice.share.shape[1] == 0
+    assert not hasattr(NeoHookean(Body(lattice.nodes), lattice), "lame_ratio")
 
 
 def test_the_mixture_is_the_mean_by_volume():
     stiff, light = Material(60.0, 0.3, 2.0), Material(1.0, 0.499, 0.9)
     share = np.array([[0.0, 0.0], [1.0, 0.0], [0.25, 0.5]])
     mu, lambda_, density = mixture(OUTSIDE, [stiff, light], share)
-    for found, name in ((mu, "mu"), (lambda_, "lambda_"), (density, "density")):
+    for mean, name in ((mu, "mu"), (lambda_, "lambda_"), (density, "density")):
         out, first, second = (getattr(m, name) for m in (OUTSIDE, stiff, light))
-        assert found == pytest.approx([out, first, 0.25 * out + 0.25 * first + 0.5 * second], rel=1e-12)
+        assert mean == pytest.approx([out, first, 0.25 * out + 0.25 * first + 0.5 * second], rel=1e-12)
     assert (OUTSIDE.mu, OUTSIDE.lambda_) == pytest.approx(lame_parameters(0.45), rel=1e-12)
 
 
@@ -147,15 +148,3 @@ def test_layers_in_series_yield_as_springs_in_series(one_device):
     # Reuss's mean, the exact one here, would move the levels above the cut by this much: more than the
     # tolerance.
     assert np.ptp(moved[level == 4]) < 1e-3
-
-
-def test_a_uniform_organ_has_the_bits_of_one_with_equal_parts_up_to_rounding(one_device):
-    organ = ball_at((0.0, 0.0, 0.0), 8.0)
-    plain = fill_with_cells(organ, 4.0)
-    parted = fill_with_cells(organ, 4.0, [ball_at((2.0, 1.0, 0.0), 5.0)])
-    one = NeoHookean(Body(plain.nodes), plain)
-    two = NeoHookean(Body(parted.nodes), parted, None, OUTSIDE, [OUTSIDE])
-    assert not hasattr(one, "lame_ratio")
-    x = deformed(plain.nodes)
-    assert np.abs(forces_of(one, x)[0] - forces_of(two, x)[0]).max() < rounding(Energy(plain, 0.45), x)
-    assert (array_of(one.mass) == array_of(two.mass)).all()

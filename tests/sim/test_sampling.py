@@ -42,7 +42,7 @@ def test_voxels_are_centred_in_the_surfaces_bounds(ball):
 
 def test_surface_samples_are_as_many_as_asked_for(ball):
     # So few that none is within the radius of another.
-    particles = fill_body(ball, 0.5, 1, surface_samples_per_mm2=0.01).particles
+    particles = fill_body(ball, 0.7, 1, surface_samples_per_mm2=0.01).particles
     on = np.abs(igl.signed_distance(particles, ball.vertices, ball.faces)[0]) < 1e-6
     assert on.sum() == int(0.01 * ball.area) == 18
 
@@ -52,12 +52,6 @@ def test_surface_samples_put_particles_on_the_surface(ball):
     depth = np.abs(igl.signed_distance(particles, ball.vertices, ball.faces)[0])
     assert (depth < 1e-6).sum() > 200
     assert cKDTree(particles).query(particles, 2)[0][:, 1].min() >= 2.0 - 1e-9
-
-
-def test_same_surface_same_particles(ball):
-    a = fill_body(ball, 2.0, 4, surface_samples_per_mm2=1.0).particles
-    b = fill_body(ball, 2.0, 4, surface_samples_per_mm2=1.0).particles
-    assert np.array_equal(a, b)
 
 
 def test_clusters_cover_and_overlap(ball):
@@ -71,19 +65,6 @@ def test_clusters_cover_and_overlap(ball):
         assert (np.diff(row) > 0).all()
         members = particles[row]
         assert cKDTree(members).query_ball_point(members, spacing, return_length=True).max() == len(members)
-
-
-def test_transposed_clusters_have_the_same_memberships(ball):
-    particles = fill_body(ball, 2.0, 4).particles
-    clusters = sample_clusters(particles, 6.0)
-    seen = clusters.T.tocsr()
-    pairs = {
-        (c, i)
-        for c in range(clusters.shape[0])
-        for i in clusters.indices[clusters.indptr[c] : clusters.indptr[c + 1]]
-    }
-    back = {(c, i) for i in range(len(particles)) for c in seen.indices[seen.indptr[i] : seen.indptr[i + 1]]}
-    assert pairs == back
 
 
 def test_a_body_touches_where_its_surface_does(ball):
@@ -102,9 +83,9 @@ def test_counts_on_a_real_kidney_are_those_of_the_papers_scale(data):
     # The paper's Fig. 5 has about 15 000 particles and 400 clusters at 2.2 mm for a kidney of this size: at
     # 3.3 mm 4500.
     kidney = trimesh.load_mesh(data / "truth" / "kits040" / "kidney.stl")
-    found = fill_body(kidney, 3.3).particles
-    assert len(found) == pytest.approx(4614, rel=0.01)
-    assert 100 < sample_clusters(found, 3.33 * 3.3).shape[0] < 450
+    particles = fill_body(kidney, 3.3).particles
+    assert len(particles) == pytest.approx(4614, rel=0.01)
+    assert 100 < sample_clusters(particles, 3.33 * 3.3).shape[0] < 450
 
 
 def test_too_little_memory_is_refused_with_the_amount_needed(ball, monkeypatch):

@@ -7,7 +7,7 @@ import pytest
 import taichi as ti
 from conftest import rotation_about
 from particle_tissue import tissue_of
-from test_solver import on_floor, solver_of
+from test_solver import solver_of
 
 from sim.body import BodyState, ParticleBody
 from sim.fields import array_of, fill
@@ -35,12 +35,11 @@ def deformed(particles: np.ndarray) -> np.ndarray:
     return 1.1 * bent @ rotation_about([1, 2, 3], 70).T + [5.0, -3.0, 8.0]
 
 
-def oracle(model: ShapeMatching, x: np.ndarray, step: float, mass: np.ndarray | None = None) -> np.ndarray:
+def oracle(model: ShapeMatching, x: np.ndarray, step: float, mass: np.ndarray | float = 1.0) -> np.ndarray:
     """One iteration of Eqs. 8, 9, 12 and 7 in float64, cluster by cluster, for particles of a mass (n,)."""
     rest, patches = model.body.rest_points, model.patches
     shared = patches.cluster_counts[patches.of_particles()].astype(float)
-    weight = 1 / shared if model.relaxation == "local" else np.ones(len(rest))
-    weight = weight if mass is None else weight * mass
+    weight = mass / shared if model.relaxation == "local" else mass * np.ones(len(rest))
     of_patch = np.repeat(np.arange(len(patches)), patches.cluster_counts)
     total = np.zeros_like(x)
     for c in range(model.count):
@@ -66,11 +65,17 @@ def moved_body(
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
-@pytest.mark.parametrize("stiffness, factor", [(1.0, 1.0), (0.4, 1.0), (0.9, 1.7)])
-def test_an_iteration_matches_the_oracle(kept, block, relaxation, stiffness, factor):
-    body, model, x = moved_body(kept, block, relaxation)
+@pytest.mark.parametrize(
+    "stiffness, factor, scaling", [(1.0, 1.0, 0.0), (0.4, 1.0, 0.0), (0.9, 1.7, 0.0), (1.0, 1.0, 0.1)]
+)
+def test_an_iteration_matches_the_oracle(kept, block, relaxation, stiffness, factor, scaling):
+    body, model, x = moved_body(kept, block, relaxation, scaling)
+    mass = np.exp(-scaling * body.rest_points[:, 2])
+    if scaling:
+        fill((body.mass_scale, mass))
+        assert np.abs(oracle(model, x, 1.0, mass) - oracle(model, x, 1.0)).max() > 100 * ROUNDING_MM
     project(model, stiffness, factor)
-    wanted = oracle(model, x, stiffness * factor)
+    wanted = oracle(model, x, stiffness * factor, mass)
     assert np.abs(wanted - x).max() > 0.3
     assert np.abs(array_of(body.predicted) - wanted).max() < ROUNDING_MM
 
@@ -87,15 +92,6 @@ def test_an_iteration_conserves_linear_and_angular_momentum(kept, block, relaxat
     assert np.abs(change.sum(axis=0)).max() < ROUNDING_MM * n**0.5 * 3
     turning = np.cross(x - x.mean(axis=0), change).sum(axis=0)
     assert np.abs(turning).max() < ROUNDING_MM * n**0.5 * 3 * np.abs(x - x.mean(axis=0)).max()
-
-
-def test_a_rigid_motion_is_no_deformation(kept, block):
-    body, model, _ = moved_body(kept, block, "local")
-    turned = body.rest_points @ rotation_about([0, 1, 1], 130).T + [100.0, 20.0, -50.0]
-    fill((body.predicted, turned))
-    project(model, 1.0, 1.0)
-    # At 100 mm float32 carries 1e-5 mm.
-    assert np.abs(array_of(body.predicted) - turned).max() < 10 * ROUNDING_MM
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
@@ -128,24 +124,6 @@ def test_patches_follow_their_particles_after_contact(one_device, block, relaxat
         assert np.abs(moment[p][:3, :3] - wanted).max() < 7 * patches.sizes[p] * ROUNDING_MM
 
 
-@kernel
-def push_out(model: ti.template(), factor: float):
-    model.contacts.find()
-    model.gather()
-    model.project(0.0, factor, 0.0)
-
-
-@pytest.mark.parametrize("factor, left", [(0.4, 0.6), (1.0, 0.0), (1.7, 0.0)])
-def test_over_relaxation_does_not_move_particles_beyond_the_surface(kept, block, factor, left):
-    model = kept(on_floor, block, -7.5, 0.0).model
-    body = model.body
-    push_out(model, factor)
-    depth = array_of(body.contact_radius) - 7.5 - body.rest_points[:, 2]
-    moved = array_of(model.predicted)[:, 2] - body.rest_points[:, 2]
-    assert (depth > 0.4).sum() > 20
-    assert np.abs(moved - (1 - left) * np.maximum(depth, 0.0)).max() < ROUNDING_MM
-
-
 def test_collapsed_flat_and_inverted_bodies_come_back_to_finite_shapes(kept, block):
     body, model, _ = moved_body(kept, block, "local")
     rest = body.rest_points
@@ -162,28 +140,6 @@ def test_collapsed_flat_and_inverted_bodies_come_back_to_finite_shapes(kept, blo
         assert np.abs(np.linalg.det(turned) - 1).max() < 1e-5
 
 
-@pytest.mark.parametrize("relaxation", ["local", "global"])
-def test_scaled_masses_move_the_clusters_towards_the_heavier(kept, block, relaxation):
-    body, model, x = moved_body(kept, block, relaxation, mass_scaling=0.1)
-    mass = np.exp(-0.1 * body.rest_points[:, 2]).astype(np.float32)
-    fill((body.mass_scale, mass))
-    project(model, 1.0, 1.0)
-    wanted = oracle(model, x, 1.0, mass.astype(float))
-    assert np.abs(wanted - oracle(model, x, 1.0)).max() > 100 * ROUNDING_MM
-    assert np.abs(array_of(body.predicted) - wanted).max() < ROUNDING_MM
-
-
-def test_frames_do_not_depend_on_those_before(kept, block):
-    body, model, x = moved_body(kept, block, "local")
-    first = array_of(model.frame)
-    body.restore(BodyState(-x[::-1].astype(np.float32), np.zeros(x.shape, np.float32)))
-    model.update_frames()
-    assert not np.array_equal(array_of(model.frame), first)
-    body.restore(BodyState(x.astype(np.float32), np.zeros(x.shape, np.float32)))
-    model.update_frames()
-    assert np.array_equal(array_of(model.frame), first)
-
-
 def test_patches_have_each_membership_of_the_clusters(block):
     rest = fill_body(block, 2.0)
     arranged, patches = group_into_patches(rest, 3.33)
@@ -193,11 +149,11 @@ def test_patches_have_each_membership_of_the_clusters(block):
         frozenset(map(tuple, rest.particles[clusters.indices[a:b]])) for a, b in pairwise(clusters.indptr)
     }
     rows = [patches.clusters.indices[a:b] for a, b in pairwise(patches.clusters.indptr)]
-    found: dict[int, set] = {}
+    memberships: dict[int, set] = {}
     for particle, p in zip(arranged.particles, patches.of_particles(), strict=True):
         for c in rows[p]:
-            found.setdefault(int(c), set()).add(tuple(particle))
-    assert {frozenset(members) for members in found.values()} == wanted
+            memberships.setdefault(int(c), set()).add(tuple(particle))
+    assert {frozenset(members) for members in memberships.values()} == wanted
     # No two patches are in the same clusters, and those with several particles come first.
     assert len({row.tobytes() for row in rows}) == len(patches)
     assert (patches.sizes[: patches.multi_count] > 1).all() and (

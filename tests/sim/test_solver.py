@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from lattice_tissue import position
 from particle_tissue import tissue_of
 
 from sim.body import ParticleBody
-from sim.fields import array_of, fill
+from sim.fields import array_of
 from sim.sampling import fill_body
 from sim.self_contact import SelfContacts
 from sim.shapes import ConvexTool, Plane, SignedDistanceField
@@ -47,10 +48,6 @@ def in_bowl(mesh) -> Solver:
     return solver_of(mesh, [bowl()], friction=0.0)
 
 
-def position(solver: Solver) -> np.ndarray:
-    return array_of(solver.body.position).astype(np.float64)
-
-
 @pytest.mark.parametrize("damping", [0.0, 12.0])
 def test_free_fall_matches_the_integrator(kept, block, damping):
     solver = kept(solver_of, block)
@@ -72,70 +69,6 @@ def test_free_fall_matches_the_integrator(kept, block, damping):
     assert np.abs(moved - [0, 0, fallen]).max() < 6e-5 * 9**0.5 * (n**3 / 3) ** 0.5
 
 
-def test_without_damping_the_scheme_is_first_order_in_the_exact_parabola(kept, block):
-    errors = []
-    for substeps in (2, 4):
-        solver = kept(solver_of, block)
-        z = position(solver)[:, 2].mean()
-        for _ in range(12):
-            solver.step(StepSettings(damping=0.0, substeps=substeps))
-        errors.append(position(solver)[:, 2].mean() - z + G * 0.2**2 / 2)
-    # Symplectic Euler is behind by g t h / 2.
-    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.01)
-
-
-@pytest.mark.parametrize("relaxation", ["local", "global"])
-def test_linear_momentum_is_conserved_without_contact_and_gravity(kept, block, relaxation):
-    solver = kept(solver_of, block, relaxation=relaxation)
-    x = position(solver)
-    velocity = np.cross([0.0, 2.0, 9.0], x) + 40 * np.sin(x[:, [1, 2, 0]]) + [100.0, 50.0, 20.0]
-    fill((solver.body.velocity, velocity))
-    for _ in range(10):
-        solver.step(StepSettings(gravity=(0, 0, 0), damping=0.0, stiffness=0.7))
-    later = array_of(solver.body.velocity).astype(np.float64)
-    # A cluster's frame rounds by three operations at 40 mm (4e-6 mm), for all its members and the nine
-    # iterations of a substep alike; over clusters and the thirty substeps it adds at random.
-    spread = solver.body.count / solver.model.count**0.5
-    rounding = 4e-6 * 180 * spread * 9 * 30**0.5
-    assert np.abs(velocity.sum(axis=0)).max() > 1000 * rounding
-    assert np.abs(later.sum(axis=0) - velocity.sum(axis=0)).max() < 3 * rounding
-
-
-def test_angular_momentum_is_conserved_to_the_order_of_the_scheme(kept, block):
-    turning, steps, time_step = 10.0, 8, 1 / 60
-    lost = []
-    for substeps in (4, 8):
-        solver = kept(solver_of, block)
-        x = position(solver)
-        velocity = np.cross([0.0, 0.0, turning], x - x.mean(axis=0))
-        fill((solver.body.velocity, velocity))
-        for _ in range(steps):
-            solver.step(StepSettings(gravity=(0, 0, 0), damping=0.0, stiffness=1.0, substeps=substeps))
-        y, v = position(solver), array_of(solver.body.velocity).astype(np.float64)
-        before = np.cross(x - x.mean(axis=0), velocity)[:, 2].sum()
-        lost.append(1 - np.cross(y - y.mean(axis=0), v)[:, 2].sum() / before)
-    # From 2 x - x_before the projection turns by w h (1 - (w h)^2): that much is lost a substep, h w^2 t in
-    # all.
-    wanted = [time_step / substeps * turning**2 * steps * time_step for substeps in (4, 8)]
-    assert lost == pytest.approx(wanted, rel=0.25)
-
-
-def test_stiffness_one_moves_a_small_body_rigidly(one_device):
-    import trimesh
-
-    # A ball of one cluster: nothing in it can deform.
-    solver = solver_of(trimesh.creation.icosphere(subdivisions=2, radius=4.0), radius=2.0)
-    assert solver.model.count <= 3
-    before = position(solver)
-    fill((solver.body.velocity, np.random.default_rng(0).normal(0, 200, before.shape)))
-    for _ in range(5):
-        solver.step(StepSettings(stiffness=1.0, gravity=(0, 0, 0)))
-    after = position(solver)
-    pairs = np.triu_indices(len(before), 1)
-    lengths = [np.linalg.norm(x[pairs[0]] - x[pairs[1]], axis=1) for x in (before, after)]
-    assert np.abs(lengths[0] - lengths[1]).max() < 1e-4
-
-
 def slide(kept, block, slope_deg: float, friction: float = 0.35) -> tuple[float, float]:
     """Acceleration down a slope over 0.2 s, relative to g, and the final speed [mm/s]; it starts from
     rest.
@@ -153,23 +86,26 @@ def slide(kept, block, slope_deg: float, friction: float = 0.35) -> tuple[float,
     return (speeds[1] - speeds[0]) / 0.2 / G, speeds[1]
 
 
-def test_sliding_starts_at_the_friction_angle(kept, block):
-    critical = np.degrees(np.arctan(0.35))
+FRICTION = 0.35
+CRITICAL_DEG = np.degrees(np.arctan(FRICTION))
+
+
+@pytest.mark.parametrize(
+    ("slope_deg", "speeds"), [(CRITICAL_DEG - 0.5, (-5.0, 5.0)), (CRITICAL_DEG + 0.5, (10, 1000))]
+)
+def test_sliding_starts_at_the_friction_angle(kept, block, slope_deg, speeds):
     # Without friction either slope would give it more than 1000 mm/s by then.
-    assert abs(slide(kept, block, critical - 0.5)[1]) < 5.0
-    assert slide(kept, block, critical + 0.5)[1] > 10.0
+    assert speeds[0] < slide(kept, block, slope_deg)[1] < speeds[1]
 
 
-@pytest.mark.parametrize("slope_deg", [25.0, 35.0])
-def test_beyond_it_the_block_accelerates_by_coulombs_law(kept, block, slope_deg):
+# It rocks and settles while it slides with friction: 5 %.
+@pytest.mark.parametrize(
+    ("slope_deg", "friction", "off"), [(25.0, 0.35, 0.05), (35.0, 0.35, 0.05), (10.0, 0.0, 0.02)]
+)
+def test_beyond_it_the_block_accelerates_by_coulombs_law(kept, block, slope_deg, friction, off):
     angle = np.radians(slope_deg)
-    wanted = np.sin(angle) - 0.35 * np.cos(angle)
-    # The block rocks and settles while it slides: 5 %.
-    assert slide(kept, block, slope_deg)[0] == pytest.approx(wanted, rel=0.05)
-
-
-def test_without_friction_a_block_slides_on_any_slope(kept, block):
-    assert slide(kept, block, 10.0, friction=0.0)[0] == pytest.approx(np.sin(np.radians(10)), rel=0.02)
+    wanted = np.sin(angle) - friction * np.cos(angle)
+    assert slide(kept, block, slope_deg, friction)[0] == pytest.approx(wanted, rel=off)
 
 
 @pytest.mark.parametrize("serial", [True, False])
@@ -178,8 +114,8 @@ def test_the_tool_follows_its_poses_and_stays_at_the_last(kept, block, serial):
     solver = solver_of(block, [tool], tool=tool, serial=serial)
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, :3, 3] = 30.0 + np.array([[0.0], [0.5], [1.5], [3.5]]) * [1.0, -2.0, 3.0]
-    for given, motion in ((poses, [2.0, -4.0, 6.0]), (None, [0.0] * 3)):
-        solver.step(StepSettings(substeps=3, iterations=1), given)
+    for way, motion in ((poses, [2.0, -4.0, 6.0]), (None, [0.0] * 3)):
+        solver.step(StepSettings(substeps=3, iterations=1), way)
         assert np.array_equal(array_of(tool.pose), poses[-1].astype(np.float32))
         # Back to where it was a substep before.
         assert array_of(tool.step_back)[:3, 3] == pytest.approx(-np.array(motion), abs=1e-5)
@@ -206,8 +142,8 @@ def bowl() -> SignedDistanceField:
     return SignedDistanceField(distance, np.full(3, -20.0), np.ones(3))
 
 
-@pytest.mark.parametrize("iterations", [1, 2, 9, 10])
-@pytest.mark.parametrize("factor", [1.0, 1.5, 2.0])
+@pytest.mark.parametrize("iterations", [1, 2, 10])
+@pytest.mark.parametrize("factor", [1.5, 2.0])
 def test_over_relaxation_is_stable(kept, ball, iterations, factor):
     solver = kept(on_floor, ball, -12.0)
     settings = StepSettings(stiffness=1.0, iterations=iterations, relaxation_factor=factor, damping=0.0)

@@ -74,10 +74,10 @@ def test_an_error_in_a_kernel_names_file_line_and_function(device):
     for _ in range(2):
         with pytest.raises(ti.TaichiCompilationError, match="not_defined_anywhere") as error:
             outer()
-        told = str(error.value)
+        message = str(error.value)
         line = inner.func.func.__code__.co_firstlineno + 2
-        assert f'"{__file__}", line {line}, in inner:' in told and "return value + not_defined" in told
-        assert f"line {outer._primal.func.__code__.co_firstlineno + 4}, in outer:" in told
+        assert f'"{__file__}", line {line}, in inner:' in message and "return value + not_defined" in message
+        assert f"line {outer._primal.func.__code__.co_firstlineno + 4}, in outer:" in message
 
 
 def test_a_decorator_reads_no_source_file(device, monkeypatch):

@@ -5,8 +5,9 @@ import hashlib
 import numpy as np
 import taichi as ti
 from coarse_patient import coarse_patient
+from lattice_tissue import position
 from test_rehearsal import LOOK
-from test_solver import position, solver_of
+from test_solver import solver_of
 
 from rehearsal.rehearsal import script_length_s
 from sim import embedding, neo_hookean
@@ -47,11 +48,11 @@ def rehearsed(threads: int) -> str:
     colour = anatomy.scanner.doppler(pictures, "colour")
     state = organ.body.snapshot()
     arrays = state.position, state.velocity, organ.wrench(), *pictures.by_name.values(), colour
-    return hashlib.sha256(b"".join(each.tobytes() for each in arrays)).hexdigest()
+    return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
 
 
 def test_a_rehearsal_gives_the_same_bits_after_another_start_with_more_threads(arrays_stored, monkeypatch):
     for module in (neo_hookean, embedding):
-        monkeypatch.setattr(module, "is_too_small", lambda *given: False)
+        monkeypatch.setattr(module, "is_too_small", lambda *counts: False)
     assert rehearsed(2) == rehearsed(4)
     ti.reset()

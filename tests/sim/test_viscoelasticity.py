@@ -58,22 +58,22 @@ def test_a_bars_stress_relaxes_as_the_hereditary_integral(one_device, ramp_s):
     def stretch_at(t):
         return 1 + 0.3 * np.clip(t / ramp_s, 0, 1)
 
-    found, times = [], []
+    stresses, times = [], []
     for step in range(1, 151):
         put(model, lattice.nodes * [1, 1, stretch_at(step * DT)])
         solver.step(settings_of(1))
         if step % 15 == 0:
             stress = array_of(model.relaxation.elastic) + array_of(model.relaxation.overstress).sum(axis=1)
             assert np.abs(stress - stress[0]).max() < 1e-4 * np.abs(stress).max()
-            found.append(stress[0, 2] / 1e3)
+            stresses.append(stress[0, 2] / 1e3)
             times.append(step * DT)
     wanted = hereditary(times, stretch_at)
     # Within a step the elastic stress is taken as linear in time: off by dt^2 / 8 of its second derivative.
     second = 0.3**2 * 6 * MATERIAL.mu / 1e3 / ramp_s**2
-    assert np.abs(np.array(found) - wanted).max() < 1.2 * DT**2 / 8 * second + 1e-4
+    assert np.abs(np.array(stresses) - wanted).max() < 1.2 * DT**2 / 8 * second + 1e-4
     # At the end most of the overstress has gone, and a fast ramp had more of it.
     assert wanted[0] > 1.3 * elastic_stress(stretch_at(times[0])) or ramp_s > 0.5
-    assert abs(found[-1] / elastic_stress(1.3) - 1) < 0.25
+    assert abs(stresses[-1] / elastic_stress(1.3) - 1) < 0.25
 
 
 @pytest.mark.parametrize("term", [PronyTerm(1.0, 0.5), PronyTerm(3.0, 2.0)])
@@ -87,18 +87,18 @@ def test_a_loaded_bar_creeps_as_the_standard_linear_solid(one_device, term):
     model = NeoHookean(Body(lattice.nodes), lattice, None, MATERIAL, fixed=fixed, load_g=load_g, prony=[term])
     # The load has a mass too, which swings, unless damped: in steps of one iteration at most a twentieth of a
     # second.
-    solver, found = Solver(model), []
+    solver, strains = Solver(model), []
     settings = settings_of(60, gravity=(0, 0, gravity), damping=120.0)
     times = np.arange(1, 181) * DT
     for _ in times:
         solver.step(settings)
         moved = array_of(model.body.position)[end, 2] - lattice.nodes[end, 2]
-        found.append(moved.mean() / (BAR[2] * CELL))
+        strains.append(moved.mean() / (BAR[2] * CELL))
     g, tau = term.modulus_ratio, term.time_s
     wanted = strain * (1 - g / (1 + g) * np.exp(-times / tau / (1 + g)))
     late = times > 0.5
     # Strains of 1 %: Hooke's law is off by that much.
-    assert np.abs(np.array(found) - wanted)[late].max() < 0.03 * strain
+    assert np.abs(np.array(strains) - wanted)[late].max() < 0.03 * strain
 
 
 def test_fast_deformation_is_resisted_by_the_sum_of_all_stiffnesses(one_device):
@@ -106,15 +106,15 @@ def test_fast_deformation_is_resisted_by_the_sum_of_all_stiffnesses(one_device):
     exp(-x)) / x, x = dt / tau.
     """
     lattice = fill_block(BAR, CELL)
-    found = []
+    forces = []
     for prony in ((), TERMS):
         model = NeoHookean(Body(lattice.nodes), lattice, prony=prony, hourglass_stiffness=0.0)
-        found.append(forces_of(model, deformed(lattice.nodes)))
+        forces.append(forces_of(model, deformed(lattice.nodes)))
     x = [DT / term.time_s for term in TERMS]
     factor = 1 + sum(
-        term.modulus_ratio * (1 - np.exp(-each)) / each for term, each in zip(TERMS, x, strict=True)
+        term.modulus_ratio * (1 - np.exp(-ratio)) / ratio for term, ratio in zip(TERMS, x, strict=True)
     )
-    for elastic, relaxing in zip(*found, strict=True):
+    for elastic, relaxing in zip(*forces, strict=True):
         assert relaxing == pytest.approx(factor * elastic, rel=1e-4, abs=1e-5 * np.abs(elastic).max())
 
 

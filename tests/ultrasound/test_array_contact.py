@@ -57,8 +57,8 @@ def test_the_face_touches_as_far_as_half_a_millimetre(block, gap, area):
 
 @pytest.mark.parametrize("x, y", [(20, 0), (-20, 0), (0, 15), (0, -15)])
 def test_beside_the_organ_nothing_touches(block, x, y):
-    found = pressed(over(x, y), block.vertices * [1, 1, 0.5] + [0, 0, 4], block)
-    assert (found.area_mm2, found.compression_mm) == (0, 0)
+    contact = pressed(over(x, y), block.vertices * [1, 1, 0.5] + [0, 0, 4], block)
+    assert (contact.area_mm2, contact.compression_mm) == (0, 0)
 
 
 @pytest.mark.parametrize("degrees", [4.0, 10.0, -10.0])
@@ -80,10 +80,10 @@ def test_a_curved_face_touches_over_the_chord_of_its_sagitta(block):
     half = np.sqrt(2 * RADIUS * CONTACT_MM - CONTACT_MM**2)
     arc = RADIUS * np.arcsin(half / RADIUS)
     at = over(length=CURVED[2])
-    found = pressed(at, block.vertices, block, CURVED, RADIUS).area_mm2
-    assert found == pytest.approx(2 * arc * CURVED[1], abs=1.01 * CELL * CURVED[1])
+    whole = pressed(at, block.vertices, block, CURVED, RADIUS).area_mm2
+    assert whole == pytest.approx(2 * arc * CURVED[1], abs=1.01 * CELL * CURVED[1])
     right = pressed(at, block.vertices + [12.0, 0, 0], block, CURVED, RADIUS).area_mm2
-    assert right == pytest.approx(found / 2)
+    assert right == pytest.approx(whole / 2)
 
 
 def test_the_points_of_a_curved_face_lie_on_it_and_stand_for_all_of_it():
@@ -119,8 +119,8 @@ def test_a_ball_squeezed_and_sheared_is_shorter_along_its_longest_chord(ball, sh
     inner = np.abs(np.einsum("ij,ij->i", ball.triangles_center, ball.face_normals)).min()
     aside = CELL / np.sqrt(2) * np.linalg.norm(back, 2)
     least = 2 * np.sqrt(inner**2 - aside**2) * (1 - 1 / longer)
-    found = pressed(over(height=0.8 * 12), ball.vertices @ map_.T, ball).compression_mm
-    assert 0.98 * most < least <= found <= most
+    compression = pressed(over(height=0.8 * 12), ball.vertices @ map_.T, ball).compression_mm
+    assert 0.98 * most < least <= compression <= most
 
 
 def test_of_several_layers_the_first_under_the_face_counts():
@@ -131,9 +131,9 @@ def test_of_several_layers_the_first_under_the_face_counts():
         layer = now[8 * n : 8 * n + 8]
         layer[layer[:, 2] < layer[:, 2].mean(), 2] += lost
     # The middle one's top is at z = 3; another lies behind the face, a third before it.
-    found = pressed(over(height=3.0), now, whole)
-    assert found.compression_mm == pytest.approx(2.0)
-    assert found.area_mm2 == pytest.approx(112.5)
+    contact = pressed(over(height=3.0), now, whole)
+    assert contact.compression_mm == pytest.approx(2.0)
+    assert contact.area_mm2 == pytest.approx(112.5)
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -47,7 +47,7 @@ def test_harmonics_have_the_square_of_the_beam_of_half_the_frequency_and_less_si
     wanted = 2 * half * probe.wavelength_mm * probe.f_number
     assert width_mm(harmonic, middle(probe), probe.focus_mm) == pytest.approx(wanted, rel=0.1)
     depth = np.array([probe.focus_mm])
-    plain, less = (clutter_weights(each, depth).sum() for each in (probe, harmonic))
+    plain, less = (clutter_weights(setting, depth).sum() for setting in (probe, harmonic))
     assert less < 0.5 * plain
 
 
@@ -96,7 +96,7 @@ def test_across_the_plane_the_beam_at_the_lens_focus_is_the_square_of_a_sinc(nam
     shift = np.linspace(0, 1, 1001)
     frequency = np.linspace(-1, 1, 2001)
     triangle = (1 - np.abs(frequency)) ** 2
-    together = np.array([(triangle * np.cos(2 * np.pi * frequency * each)).sum() for each in shift])
+    together = np.array([(triangle * np.cos(2 * np.pi * frequency * lag)).sum() for lag in shift])
     half = np.interp(-0.5, -((together / together[0]) ** 2), shift) * probe.wavelength_mm * focus / height
     assert correlation[0] * np.sqrt(2 * np.log(2)) == pytest.approx(half, rel=0.1)
     # Behind the focus the slice is thicker, but the speckle hardly longer.

@@ -91,8 +91,8 @@ def test_the_volume_of_flow_is_along_the_vessel_in_thick_oblique_slices(device, 
     away = np.linalg.norm(at - np.outer(at @ along, along), axis=1)
     speed = np.linalg.norm(values[tuple(middle.T)][:, :3], axis=1)
     for ring in range(8):
-        found = speed[(away >= ring) & (away < ring + 1)].mean() / speed.max()
-        assert found == pytest.approx(1 - ((ring + 0.5) / 8) ** 2, abs=0.5 * 2 / 8)
+        mean_share = speed[(away >= ring) & (away < ring + 1)].mean() / speed.max()
+        assert mean_share == pytest.approx(1 - ((ring + 0.5) / 8) ** 2, abs=0.5 * 2 / 8)
     table = flow_table()[kind]
     slowest, fastest = np.interp([8 - 2.4, 8], table["radius_mm"], table["peak_cm_s"]) / 100
     assert 0.999 * slowest < speed.max() < 1.001 * fastest
@@ -178,7 +178,7 @@ def test_stored_flow_is_the_flow_whatever_the_hu(monkeypatch):
 
 def test_the_pulse_rises_to_systole_and_falls_until_the_next_beat():
     time = np.linspace(0, BEAT_S, 400, endpoint=False)
-    share = np.array([pulse_share(each) for each in time])
+    share = np.array([pulse_share(instant) for instant in time])
     assert share.max() == pytest.approx(1, abs=0.01) and time[share.argmax()] == pytest.approx(
         SYSTOLE_S, abs=0.01
     )

@@ -81,17 +81,6 @@ def test_a_plane_shows_a_slab_of_its_thickness(organ, axes, thickness):
     if np.linalg.norm(steps) <= VOXEL_MM:
         assert organ.seen[inside].all()
     assert organ.seen[inside].mean() > 0.97
-    if np.array_equal(axes, UPRIGHT):
-        return  # which has whole layers of voxels
-    # So of the ball between a slab and one thicker by a voxel's extent less a part's step; counting is off by
-    # 3 %.
-    height, inner = np.dot(normal, origin), (aside < 0) & organ.targets["organ"]
-    share = (
-        inner[np.abs(off) < thickness / 2].sum() / organ.targets["organ"][np.abs(off) < thickness / 2].sum()
-    )
-    seen = (organ.seen & inner).sum() * VOXEL_MM**3
-    assert 0.97 * slab(thickness, height) * share < seen
-    assert seen < 1.03 * slab(thickness + 2 * reach - thickness / parts, height) * share
 
 
 def slab(thickness: float, height: float) -> float:
@@ -214,9 +203,9 @@ def test_what_was_not_imaged_is_the_gap(organ, first, last):
     sweep(organ, first, last)
     caps = sorted([cap(R + x) for x in (first, -last) if R + x > 0], reverse=True)
     sides = {first: -1, last: 1}
-    found = organ.gaps("organ")
-    assert len(found) == len(caps)
-    for gap, volume in zip(found, caps, strict=True):
+    gaps = organ.gaps("organ")
+    assert len(gaps) == len(caps)
+    for gap, volume in zip(gaps, caps, strict=True):
         edge = first if np.isclose(volume, cap(R + first)) and first > -R else last
         # The edge lies half a voxel off at most; facets take 1.2 % of a volume.
         off = VOXEL_MM / 2 * np.pi * (R**2 - edge**2) / 1000

@@ -19,7 +19,6 @@ from test_bmode import (
     speed_ratio,
 )
 
-from sim.device import start
 from sim.fields import array_of, fill
 from ultrasound.acoustics import acoustic_values
 from ultrasound.bmode import BMode
@@ -45,8 +44,8 @@ def distance_field(value) -> SampledVolume:
 
 def wet(tank: Tank, distance, fluid=WATER, **settings) -> Tank:
     """The tank with an organ, seen through fluid; ``settings`` are those of ``Propagation``."""
-    given = dict(contact="organ", contact_gap_mm=GAP_MM, has_fluid=True) | settings
-    sound = Propagation(tank.tissue, distance_field(distance), tank.plane, probe_of(), 0.5, **given)
+    values = dict(contact="organ", contact_gap_mm=GAP_MM, has_fluid=True) | settings
+    sound = Propagation(tank.tissue, distance_field(distance), tank.plane, probe_of(), 0.5, **values)
     sound.surface, sound.fluid = MIRROR, fluid
     tank.bmode = BMode(sound, probe_of())
     return tank
@@ -57,18 +56,13 @@ def below(x, y):
     return -y
 
 
-@pytest.fixture(scope="module", autouse=True)
-def taichi():
-    start("cpu")
-
-
 @pytest.fixture(scope="module")
-def half_space(taichi) -> Tank:
+def half_space(one_device) -> Tank:
     return wet(flat_tank(0.5), below)
 
 
 @pytest.fixture(scope="module")
-def murky(taichi) -> Tank:
+def murky(one_device) -> Tank:
     return wet(flat_tank(0.5), below, MURKY)
 
 
@@ -125,7 +119,7 @@ def test_an_element_is_coupled_as_far_as_the_layer_reaches(half_space, gap, coup
     assert (array_of(half_space.bmode.sound.contact) == couples).all()
 
 
-def test_over_a_slope_those_near_enough_are_coupled_and_the_others_are_dark(taichi):
+def test_over_a_slope_those_near_enough_are_coupled_and_the_others_are_dark(one_device):
     slope, gap = np.radians(12), 3.0
     tank = wet(flat_tank(0.5), lambda x, y: x * np.sin(slope) - y * np.cos(slope))
     tank.fill(backscatter=0.1)
@@ -141,7 +135,7 @@ def test_over_a_slope_those_near_enough_are_coupled_and_the_others_are_dark(taic
     assert near - far > 60
 
 
-def test_inside_the_gap_it_is_as_gel_of_the_same_values(taichi):
+def test_inside_the_gap_it_is_as_gel_of_the_same_values(one_device):
     gel = 1.5
     fluid = wet(flat_tank(0.5), below, (gel, 0.0, 0.0, 0.0))
     images = []
@@ -152,7 +146,7 @@ def test_inside_the_gap_it_is_as_gel_of_the_same_values(taichi):
 
 
 @pytest.mark.parametrize(("gap", "has_layer"), [(3.0, True), (8.0, False)])
-def test_behind_the_organ_and_without_coupling_is_what_the_ct_shows(taichi, gap, has_layer):
+def test_behind_the_organ_and_without_coupling_is_what_the_ct_shows(one_device, gap, has_layer):
     tank = wet(flat_tank(0.5), lambda x, y: np.abs(y - THICKNESS_MM / 2) - THICKNESS_MM / 2)
     tank.fill(impedance=FAT, attenuation=0.6)
     sound = tank.bmode.sound
@@ -188,7 +182,7 @@ def test_no_blood_flows_in_it(half_space):
     assert energy[y < -0.5].max() < 1e-9 * energy[y > 0.5].max()
 
 
-def test_beside_a_surface_that_a_scanline_passes_in_the_depth_there_is_no_fluid(taichi):
+def test_beside_a_surface_that_a_scanline_passes_in_the_depth_there_is_no_fluid(one_device):
     """As in the hilum: nearer to the organ than the layer is thick around a depth of 20 mm alone, and
     nowhere inside.
     """

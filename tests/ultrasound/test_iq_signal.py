@@ -6,7 +6,6 @@ from conftest import rotation_about
 from scipy import io, signal
 from test_bmode import BOUNDLESS, Tank, probe_of, speed_ratio
 
-from sim.device import start
 from ultrasound.bmode import Wavefront
 from ultrasound.iq_signal import RF_PER_PERIOD, iq_signal, rf_of, save_iq
 from ultrasound.probe import Probe
@@ -16,8 +15,7 @@ SETTINGS = dict(depth_mm=20.0, transducer_width_mm=16.0, focus_depth_percent=50.
 
 
 @pytest.fixture(scope="module")
-def tank():
-    start("cpu")
+def tank(one_device):
     tank = Tank((BOUNDLESS,) * 3, (1, 1, 1), (0.0, 0.0, 0.0))
     tank.fill(1.5804, 0.0, 0.1)
     return tank
@@ -42,9 +40,9 @@ def test_motion_along_the_beam_turns_the_phase_by_two_wavenumbers(tank, geometry
     before, _ = look(tank, probe, (0, 0, 0))
     after, _ = look(tank, probe, (0, towards_mm, 0))
     middle = slice(90, 102) if geometry == "LINEAR" else slice(104, 108)
-    found = np.angle((after * before.conj())[middle, 60:600].sum())
+    phase = np.angle((after * before.conj())[middle, 60:600].sum())
     # The tissue is nearer by as much as the probe moved towards it: the echo is earlier.
-    assert found == pytest.approx(2 * 2 * np.pi / probe.wavelength_mm * towards_mm, rel=0.05)
+    assert phase == pytest.approx(2 * 2 * np.pi / probe.wavelength_mm * towards_mm, rel=0.05)
 
 
 @pytest.mark.parametrize("impedance", [1.38, 1.62])
@@ -55,8 +53,8 @@ def test_tissue_that_slows_sound_turns_the_phase_further_and_keeps_the_frequency
     after, _ = look(tank, probe, (0, 0.004, 0))
     tank.fill(1.5804, 0.0, 0.1)
     middle = slice(90, 102), slice(60, 600)
-    found = np.angle((after * before.conj())[middle].sum())
-    assert found == pytest.approx(4 * np.pi / probe.wavelength_mm * 0.004 / speed_ratio(impedance), rel=0.05)
+    phase = np.angle((after * before.conj())[middle].sum())
+    assert phase == pytest.approx(4 * np.pi / probe.wavelength_mm * 0.004 / speed_ratio(impedance), rel=0.05)
     # Phase from sample to sample: at the centre frequency, none.
     step = np.angle((before[middle][:, 1:] * before[middle][:, :-1].conj()).sum())
     assert abs(step) * 1.54 / (4 * np.pi * probe.sample_mm) < 0.01 * probe.frequency_mhz
@@ -70,10 +68,10 @@ def test_the_angle_to_a_wavefront_is_that_of_the_turn_or_of_the_way_around_the_a
     assert wavefront.angle_deg(probe, first) < 1e-3
     turned = first.copy()
     turned[:3, :3] = rotation_about([0, 0, 1], 4.0) @ first[:3, :3]
-    found = wavefront.angle_deg(probe, turned)
+    angle = wavefront.angle_deg(probe, turned)
     # Turned about the middle of the face, 20 mm above the middle of the image and, of a curved array, 60 mm
     # below the apex.
-    assert found == pytest.approx(4.0 if geometry == "LINEAR" else 4.0 * 60 / 80, rel=0.05)
+    assert angle == pytest.approx(4.0 if geometry == "LINEAR" else 4.0 * 60 / 80, rel=0.05)
 
 
 def test_the_signal_is_that_of_the_image(tank):
@@ -83,8 +81,8 @@ def test_the_signal_is_that_of_the_image(tank):
     iq, rest = tank.bmode.iq_of_last(probe, Wavefront.of(probe, plane))
     # At the place of reference the phase of all scanlines turns alike: it changes no magnitude, but for
     # rounding of 0.1 rad.
-    found = 20 * np.log10(np.abs(iq) + 1e-9)
-    assert np.median(np.abs(found - decibel + probe.gain_db())) < 0.01
+    level = 20 * np.log10(np.abs(iq) + 1e-9)
+    assert np.median(np.abs(level - decibel + probe.gain_db())) < 0.01
     u, depth = probe.scanlines()[0][:, 0], (np.arange(640) + 0.5) * probe.sample_mm
     np.testing.assert_allclose(rest[..., 0], np.broadcast_to(u[:, None], rest.shape[:2]), atol=1e-3)
     np.testing.assert_allclose(rest[..., 1], np.broadcast_to(depth, rest.shape[:2]), atol=1e-2)
@@ -113,11 +111,11 @@ def test_files_have_the_sampling_and_the_motion_of_the_tissue(tank, tmp_path, su
     save_iq(written, tmp_path / f"a.{suffix}", suffix)
     # No date, and no name of the machine.
     assert suffix == "npz" or b"reated on" not in (tmp_path / "a.mat").read_bytes()[:128]
-    found = np.load(tmp_path / "a.npz") if suffix == "npz" else io.loadmat(tmp_path / "a.mat")
-    assert found["iq"].shape == (640, 192) and np.iscomplexobj(found["iq"]) and (found["iq"] == iq.T).all()
-    assert float(np.squeeze(found["iq_sampling_mhz"])) == pytest.approx(1.54 / 2 / (20 / 640))
+    arrays = np.load(tmp_path / "a.npz") if suffix == "npz" else io.loadmat(tmp_path / "a.mat")
+    assert arrays["iq"].shape == (640, 192) and np.iscomplexobj(arrays["iq"]) and (arrays["iq"] == iq.T).all()
+    assert float(np.squeeze(arrays["iq_sampling_mhz"])) == pytest.approx(1.54 / 2 / (20 / 640))
     # The probe moved by 1 mm to its marked side and 0.25 mm across the plane: the tissue moved the other way.
     across = planes[0].world_from_plane[2, 2] * 0.25
-    motion = found["motion_mm"].reshape(-1, 3)
+    motion = arrays["motion_mm"].reshape(-1, 3)
     np.testing.assert_allclose(motion, np.broadcast_to([-1.0, 0.0, -across], (640 * 192, 3)), atol=1e-4)
     assert (iq_signal(iq, rest, probe, planes[0], None).motion_mm == 0).all()

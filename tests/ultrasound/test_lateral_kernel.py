@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from test_bmode import GEOMETRIES, LINES, flat_tank, probe_of
 
-from sim.device import start
 from sim.fields import array_of
 from ultrasound.beam import lateral_profiles
 from ultrasound.lateral_kernel import (
@@ -27,12 +26,12 @@ LAGS = np.arange(-MAX_HALF_WIDTH, MAX_HALF_WIDTH + 1)
 def test_weights_have_sum_1_and_end_where_the_beam_is_below_a_hundredth(geometry):
     weights, half, _ = lateral_kernel(probe_of(geometry))
     assert weights.sum(axis=-1) == pytest.approx(np.ones(half.shape))
-    for each in np.ndindex(half.shape):
-        inside = np.abs(LAGS) <= half[each]
-        assert (weights[each][~inside] == 0).all()
+    for place in np.ndindex(half.shape):
+        inside = np.abs(LAGS) <= half[place]
+        assert (weights[place][~inside] == 0).all()
         # Relative to the scanline itself, which near the array's end is a little less than its neighbour.
-        edges = weights[each][inside][[0, -1]] / weights[each].max()
-        assert half[each] == MAX_HALF_WIDTH or edges.max() >= 0.9 * LEAST
+        edges = weights[place][inside][[0, -1]] / weights[place].max()
+        assert half[place] == MAX_HALF_WIDTH or edges.max() >= 0.9 * LEAST
 
 
 @pytest.mark.parametrize("geometry", GEOMETRIES)
@@ -43,9 +42,9 @@ def test_the_speckle_gain_restores_the_mean_square_of_noise(geometry):
         apart = (LAGS[:, None] - LAGS) * probe.line_spacing_mm(np.array([depth]))[0]
         # Of white noise through a Gaussian of SD s: exp(-d^2 / 4 s^2).
         correlation = np.exp(-(apart**2) / (4 * probe.speckle_sd_mm**2))
-        for each in range(CLASSES):
-            mean_square = weights[each, packet] @ correlation @ weights[each, packet]
-            assert speckle_gain[each, packet] ** 2 * mean_square == pytest.approx(1.0)
+        for number in range(CLASSES):
+            mean_square = weights[number, packet] @ correlation @ weights[number, packet]
+            assert speckle_gain[number, packet] ** 2 * mean_square == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("sd", [3.0, 6.0])
@@ -53,9 +52,9 @@ def test_the_speckle_gain_restores_the_mean_square_of_noise(geometry):
 def test_a_narrowed_kernel_makes_noise_as_wide_as_the_profile(sd, noise_sd):
     kernel = narrowed(np.exp(-0.5 * (LAGS / sd) ** 2), noise_sd)
     together = np.convolve(kernel, np.exp(-0.5 * (LAGS / noise_sd) ** 2), "same")
-    found = np.sqrt((together * LAGS**2).sum() / together.sum())
+    width = np.sqrt((together * LAGS**2).sum() / together.sum())
     # Linear between scanlines: wider by some 1 / 12 of their distance squared.
-    assert found == pytest.approx(sd, rel=0.03)
+    assert width == pytest.approx(sd, rel=0.03)
 
 
 @pytest.mark.parametrize("geometry", GEOMETRIES)
@@ -85,14 +84,13 @@ def test_clutter_is_the_energy_of_the_profile_beyond_the_kernel():
         assert row.sum() == pytest.approx(energy[beyond].sum() / energy[~beyond].sum(), rel=0.35)
 
 
-def test_scanlines_are_summed_by_their_weights_and_mirrored_at_the_arrays_ends():
-    start("cpu")
+def test_scanlines_are_summed_by_their_weights_and_mirrored_at_the_arrays_ends(one_device):
     tank, probe = flat_tank(0.5), probe_of(focus_depth_percent=70.0, f_number=2.0)
     tank.fill(backscatter=0.1)
-    found = tank.look(probe, "speckle") - probe.gain_db()
+    decibel = tank.look(probe, "speckle") - probe.gain_db()
     weights, half, _ = lateral_kernel(probe)
     assert half.max() > 8 and np.ptp(half) > 4
-    real, imaginary = (array_of(each).astype(float) for each in (tank.bmode.real, tank.bmode.imaginary))
+    real, imaginary = (array_of(field).astype(float) for field in (tank.bmode.real, tank.bmode.imaginary))
     classes, side = scanline_classes(probe)
     packet = np.arange(real.shape[1]) // LANES
     scanlines = np.arange(LINES)
@@ -106,4 +104,4 @@ def test_scanlines_are_summed_by_their_weights_and_mirrored_at_the_arrays_ends()
     wanted = 20 * np.log10(np.abs(echo) + 1e-9)
     # Sums of some 20 terms in float32, of which as much as all but a hundredth may cancel.
     seen = np.abs(echo) > 1e-3
-    assert seen.mean() > 0.9 and np.abs(found - wanted)[seen].max() < 0.02
+    assert seen.mean() > 0.9 and np.abs(decibel - wanted)[seen].max() < 0.02

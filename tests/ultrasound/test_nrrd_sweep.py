@@ -206,17 +206,16 @@ HOSTILE = {
     "no colon": (dict(lines={"endian: little": "endian little"}), "'endian little': expected name: value"),
     "twice": (dict(lines={"endian: little": "type: uint8"}), "'type': found twice"),
     "a frame's twice": (dict(lines={"Seq_Frame0001_Timestamp": "Seq_Frame0001_FrameNumber"}), "found twice"),
-    "no frame's "
-    "number": (dict(lines={"Seq_Frame0001_Status": "Seq_FrameX_Status"}), "expected Seq_Frame0000_Name"),
+    "no frame's number": (
+        dict(lines={"Seq_Frame0001_Status": "Seq_FrameX_Status"}),
+        "expected Seq_Frame0000_Name",
+    ),
     "a frame missing": (dict(lines={"  2\n": "  3\n"}), "sizes has 3 frames, but 2 have fields"),
     "no type": (dict(lines={"type: uint8\n": ""}), "type = '': expected uint8"),
     "16 bits": (dict(lines={"uint8": "uint16"}), "type = 'uint16': expected uint8"),
-    "no "
-    "orientation": (dict(lines={"ultrasound image "
-            "orientation:=MF\n": ""}), "ultrasound image orientation = ''"),
+    "no orientation": (dict(lines={"ultrasound image orientation:=MF\n": ""}), "image orientation = ''"),
     "descending": (dict(lines={"orientation:=MF": "orientation:=MFD"}), "'MFD': expected MF or"),
-    "colours": (dict(lines={"domain domain     ": "vector domain     "}), "kinds = .*expected domain domain "
-            "list or"),
+    "colours": (dict(lines={"domain domain     ": "vector domain     "}), "kinds = .*expected domain "),
     "as 3D Slicer": (dict(lines={"domain domain                list": "list domain domain"}), "kinds = "),
     "no kinds": (dict(lines={"kinds: domain domain                list\n": ""}), "kinds = ''"),
     "two sizes": (dict(lines={"4 3   ": "4   "}), "sizes = .*expected columns rows frames"),
@@ -226,9 +225,7 @@ HOSTILE = {
         dict(lines={"domain                list": "domain domain list", "4 3   ": "4 1 3   "}),
         "expected images, not volumes",
     ),
-    "another "
-    "file": (dict(lines={"endian: "
-            "little": "data file: ../other.raw"}), "data file = .*right after the header"),
+    "another file": (dict(lines={"endian: little": "data file: ../other.raw"}), "right after the header"),
     "skipped bytes": (dict(lines={"endian: little": "byte skip: -1"}), "byte skip = '-1'"),
     "text": (dict(encoding="ascii"), "encoding = 'ascii': expected raw or gz or gzip"),
     "bzip2": (dict(encoding="bz2", pixels=b""), "encoding = 'bz2'"),
@@ -238,10 +235,9 @@ HOSTILE = {
     "cut off": (dict(encoding="gz", pixels=SQUEEZED[:-5]), "not whole gzip data"),
     "bad checksum": (dict(encoding="gz", pixels=SQUEEZED[:-8] + bytes(8)), "not whole gzip data"),
     "left over": (dict(encoding="gz", pixels=SQUEEZED + b"xxxx"), "not whole gzip data"),
-    "fewer": (dict(encoding="gz", pixels=gzip.compress(bytes(23))), "23 bytes of pixels or more in the gzip "
-            "data"),
+    "fewer": (dict(encoding="gz", pixels=gzip.compress(bytes(23))), "23 bytes of pixels or more in "),
     "a bomb": (dict(encoding="gz", pixels=gzip.compress(bytes(10_000_000))), "25 bytes of pixels or more"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("changed, words", HOSTILE.values(), ids=HOSTILE.keys())

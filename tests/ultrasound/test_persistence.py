@@ -68,22 +68,7 @@ def test_other_images_and_the_given_ones_stay_as_they_are():
     persistence = Persistence()
     for number in (1, 2):
         grey, ct = images_of(number).by_name[B_MODE], images_of(-number % 7, name=CT).by_name[CT]
-        given = replace(images_of(number), by_name={B_MODE: grey.copy(), CT: ct})
-        mixed = persistence.mixed(given, SHARE)
+        images = replace(images_of(number), by_name={B_MODE: grey.copy(), CT: ct})
+        mixed = persistence.mixed(images, SHARE)
         assert list(mixed.by_name) == [B_MODE, CT] and mixed.by_name[CT] is ct
-        assert np.array_equal(given.by_name[B_MODE], grey) and mixed.location == given.location
-
-
-def test_two_viewers_that_take_turns_do_not_influence_each_other():
-    alone = [[shown(p, images_of(n)) for n in numbers] for p, numbers in both()]
-    (first, ones), (second, others) = both()
-    turns = [
-        (shown(first, images_of(a)), shown(second, images_of(b))) for a, b in zip(ones, others, strict=True)
-    ]
-    for mine, own in zip(zip(*turns, strict=True), alone, strict=True):
-        assert all(np.array_equal(*pair) for pair in zip(mine, own, strict=True))
-
-
-def both() -> list[tuple[Persistence, range]]:
-    """Two viewers, and the images of each."""
-    return [(Persistence(), range(5)), (Persistence(), range(10, 15))]
+        assert np.array_equal(images.by_name[B_MODE], grey) and mixed.location == images.location

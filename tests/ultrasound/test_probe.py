@@ -17,12 +17,10 @@ from test_bmode import (
     TISSUE,
     USUAL,
     Tank,
-    depths,
     flat_tank,
     probe_of,
 )
 
-from sim.device import start
 from ultrasound.probe import GREY_EXPONENTS, PROBES, Probe, ProbeError, load_probe
 from ultrasound.probe_manipulator import advanced, pose_at
 from ultrasound.sampled_volume import distance_volume
@@ -152,27 +150,23 @@ def test_lines_leave_the_face_at_the_middles_of_equal_shares(geometry):
     assert probe.elements() == pytest.approx(elements, abs=1e-12)
 
 
-@pytest.mark.parametrize("geometry, steering", [*((each, 0.0) for each in GEOMETRIES), ("LINEAR", -20.0)])
+@pytest.mark.parametrize(
+    "geometry, steering", [*((name, 0.0) for name in GEOMETRIES), ("LINEAR", -20.0), ("CURVILINEAR", 12.0)]
+)
 def test_beam_coordinates_invert_the_scanlines(geometry, steering):
     probe = probe_of(geometry, steering_deg=steering)
     start, direction = probe.scanlines()
+    turned = np.arctan2(*direction.T) - np.arctan2(*probe_of(geometry).scanlines()[1].T)
+    assert np.degrees(turned) == pytest.approx(steering, abs=1e-6)
     lines, along = np.meshgrid(np.arange(LINES), [1.0, 17.3, 40.0, 79.9], indexing="ij")
     place = start[lines] + along[..., None] * direction[lines]
     line, depth = probe.beam_coordinates(place[..., 0], place[..., 1])
     assert line == pytest.approx(lines, abs=1e-9) and depth == pytest.approx(along, abs=1e-9)
+    if geometry == "CURVILINEAR" and steering:
+        return  # Their distance is that along the face.
     # Neighbouring lines are as far apart as is said: the chord is 1 - step^2 / 24 of the arc.
     apart = np.linalg.norm(np.diff(place, axis=0), axis=-1)
     assert apart == pytest.approx(np.tile(probe.line_spacing_mm(along[0]), (LINES - 1, 1)), rel=1e-5)
-
-
-def test_beam_coordinates_invert_steered_scanlines_of_a_curved_array():
-    probe = probe_of("CURVILINEAR", steering_deg=12.0)
-    start, direction = probe.scanlines()
-    assert np.degrees(np.arctan2(*direction[96])) == pytest.approx(12.0 + -2.5 + 45 / 384, abs=1e-6)
-    place = start[:, None] + np.array([1.0, 40.0, 79.0])[:, None] * direction[:, None]
-    line, depth = probe.beam_coordinates(place[..., 0], place[..., 1])
-    assert line == pytest.approx(np.repeat(np.arange(LINES)[:, None], 3, axis=1), abs=1e-6)
-    assert depth == pytest.approx(np.tile([1.0, 40.0, 79.0], (LINES, 1)), abs=1e-6)
 
 
 def test_angles_of_compounding_are_around_that_of_the_probe_which_is_the_first():
@@ -192,19 +186,6 @@ def test_angles_of_compounding_are_around_that_of_the_probe_which_is_the_first()
 def test_what_an_array_cannot_steer_is_refused(geometry, settings, meant):
     with pytest.raises(ValueError, match=meant):
         probe_of(geometry, **settings)
-
-
-@pytest.mark.parametrize("geometry", list(GEOMETRIES))
-def test_the_extent_is_the_box_around_all_lines(geometry):
-    probe = probe_of(geometry)
-    fine = probe.model_copy(update={"number_of_scanlines": 20_001})
-    start, direction = fine.scanlines()
-    ends = np.concatenate([start, start + 80.0 * direction])
-    width, depth, above = probe.extent_mm
-    # Symmetric about the middle; the outermost line's edge is half a line farther.
-    assert width / 2 == pytest.approx(np.abs(ends[:, 0]).max(), rel=1e-4)
-    assert above == pytest.approx(-ends[:, 1].min(), abs=1e-3)
-    assert depth - above == pytest.approx(ends[:, 1].max(), rel=1e-4)
 
 
 def test_a_pictures_pixels_are_where_its_matrix_takes_them():
@@ -236,17 +217,12 @@ def test_gain_is_the_sum_of_knob_course_and_sliders():
 
 
 @pytest.fixture(scope="module")
-def taichi():
-    start("cpu")
-
-
-@pytest.fixture(scope="module")
-def tank(taichi) -> Tank:
+def tank(one_device) -> Tank:
     return flat_tank(0.5)
 
 
 @pytest.fixture(scope="module")
-def gated(taichi) -> Tank:
+def gated(one_device) -> Tank:
     """Sound enters within a millimetre of the organ, which is all below y = 0."""
     organ = trimesh.creation.box([70.0, 60.0, 30.0])
     organ.apply_translation([0.0, 30.0, 0.0])
@@ -332,8 +308,8 @@ def test_a_target_is_drawn_where_it_is(tank, geometry, target):
     tank.look(probe_of(geometry))
     amplitude = 10 ** (tank.picture / 255.0 * 60 / 20) - 1
     u, v = pixel_places(geometry)
-    found = [np.average(u, weights=amplitude), np.average(v, weights=amplitude)]
-    assert found == pytest.approx(target, abs=max(u[0, 1] - u[0, 0], v[1, 0] - v[0, 0]) / 2)
+    centre = [np.average(u, weights=amplitude), np.average(v, weights=amplitude)]
+    assert centre == pytest.approx(target, abs=max(u[0, 1] - u[0, 0], v[1, 0] - v[0, 0]) / 2)
 
 
 def test_gain_and_its_course_over_depth_are_added(tank):
@@ -343,10 +319,6 @@ def test_gain_and_its_course_over_depth_are_added(tank):
     for detail_level in ("reflection", "speckle"):
         added = tank.look(louder, detail_level) - tank.look(probe_of(), detail_level)
         assert np.abs(added - louder.gain_db()).max() < 1e-3
-    # 12 dB of the knob, 0.1 dB/mm/MHz over depth and 7.2 dB of a slider.
-    assert louder.gain_db()[-1] == pytest.approx(
-        12 + loss_db(0.1 * depths(louder)[-1], 7.5)[0] + 7.2, abs=0.02
-    )
 
 
 def test_the_grey_map_bends_the_greys_between_black_and_white(tank):

@@ -16,7 +16,7 @@ def test_losses_and_length_are_those_of_the_spectrum(frequency):
     # Sums of a thousand frequencies and of twenty times as many.
     assert -pulse.speckle_db[PATHS] == pytest.approx(loss_db(path_db, frequency), abs=0.02)
     assert -pulse.echo_db[PATHS] == pytest.approx(loss_db(path_db, frequency, "echo"), abs=0.02)
-    length = [fwhm_mm(each, frequency) for each in path_db]
+    length = [fwhm_mm(path, frequency) for path in path_db]
     assert pulse.axial_sd_mm[PATHS] * FWHM_OF_SD == pytest.approx(length, rel=0.005)
     assert len(pulse.axial_sd_mm) == PATH_ENTRIES
 

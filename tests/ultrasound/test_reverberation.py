@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from test_bmode import GAS, TISSUE, depths, flat_tank, peaks, probe_of, speed_ratio
 
-from sim.device import start
 from sim.fields import array_of
 from ultrasound.interface import Surface
 from ultrasound.probe import BUILD_UP_MM
@@ -29,8 +28,7 @@ SILENT = 1e-9
 
 
 @pytest.fixture(scope="module")
-def tank():
-    start("cpu")
+def tank(one_device):
     return flat_tank(0.5)
 
 
@@ -86,10 +84,10 @@ def test_bubbles_are_at_a_share_of_places_and_ring_on(tank):
     bubbles = ring.max(axis=1) > SILENT
     # 192 scanlines see 27 cells of 1.5 mm.
     assert bubbles.mean() < 4 * BUBBLE_SHARE
-    found = [level_of(tank, probe_of(transducer_width_mm=width))[0] for width in (15.0, 25.0, 35.0, 45.0)]
-    shares = [(each[:, int(30 / step)] > SILENT).mean() for each in found]
+    levels = [level_of(tank, probe_of(transducer_width_mm=width))[0] for width in (15.0, 25.0, 35.0, 45.0)]
+    shares = [(values[:, int(30 / step)] > SILENT).mean() for values in levels]
     assert 0.0 < np.mean(shares) < 3 * BUBBLE_SHARE
-    ringing_lines = np.concatenate([each[each[:, int(30 / step)] > SILENT] for each in found])
+    ringing_lines = np.concatenate([values[values[:, int(30 / step)] > SILENT] for values in levels])
     fall_db = 20 * np.log10(ringing_lines[:, int(30 / step)] / ringing_lines[:, int(40 / step)])
     assert fall_db == pytest.approx(0.5 * step * (int(40 / step) - int(30 / step)), abs=0.01)
     assert ringing_lines.max() <= BUBBLE_AMPLITUDE * 1.001

@@ -59,7 +59,7 @@ def frame_of(**fields) -> Sweep:
 
 def tracked(**matrices) -> dict[str, str]:
     """Fields of a frame whose transforms are OK."""
-    return {key: text for each in matrices.items() for key, text in transform_fields(*each).items()}
+    return {key: text for named in matrices.items() for key, text in transform_fields(*named).items()}
 
 
 @pytest.mark.parametrize("sample", SAMPLES)
@@ -76,19 +76,6 @@ def test_what_plus_wrote_comes_back_line_for_line(data, tmp_path, sample):
         before[size] = after[size]
     assert after == before
     assert np.array_equal(read_sweep(copy).images, sweep.images)
-
-
-def test_a_sweep_of_poses_alone(data):
-    sweep = read_sweep(data / "us/SlidingProbeTrackingData.igs.mha")
-    assert len(sweep) == 85
-    assert sweep.images.shape == (85, 0, 0)
-    assert not sweep.is_image_ok(0)
-    assert sweep.times_s[0] == 167.1779999999853
-    assert np.all(np.diff(sweep.times_s) > 0)
-    # ReferenceToTracker is the identity.
-    assert sweep.transform("Probe", "Reference", 0)[:3, 3] == pytest.approx(
-        [91.98129272, -50.49953842, -10.98241711]
-    )
 
 
 def test_a_chain_is_the_product_of_its_transforms(tmp_path):
@@ -129,13 +116,6 @@ def test_the_spine_with_its_calibration(data):
         assert sweep.transform("Image", "Reference", frame) == pytest.approx(expected, abs=1e-9)
         phantom = np.linalg.inv(sweep.constant["PhantomToReference"]) @ expected
         assert sweep.transform("Image", "Phantom", frame) == pytest.approx(phantom, abs=1e-9)
-
-
-def test_a_stylus_unseen_is_none_and_the_probe_does_not_need_it(data):
-    sweep = read_sweep(data / "us/NwirePhantomFreehand.igs.mha")
-    assert all(sweep.transform("Stylus", "Reference", frame) is None for frame in range(len(sweep)))
-    assert sweep.transform("Probe", "Reference", 0).shape == (4, 4)
-    assert all(sweep.is_image_ok(frame) for frame in range(len(sweep)))
 
 
 @pytest.mark.parametrize(
@@ -253,9 +233,7 @@ def written(path, **fields):
 
 def test_the_header_of_a_new_sweep(tmp_path):
     lines, pixels = parts_of(written(tmp_path / "new.igs.mha", Note="a"))
-    assert (
-        b"".join(lines).decode()
-        == f"""ObjectType = Image
+    wanted = f"""ObjectType = Image
 NDims = 3
 AnatomicalOrientation = RAI
 BinaryData = True
@@ -272,33 +250,20 @@ TransformMatrix = 1 0 0 0 1 0 0 0 1
 UltrasoundImageOrientation = MF
 UltrasoundImageType = BRIGHTNESS
 Note = a
-Seq_Frame0000_ProbeToReferenceTransform = 0 -1 0 0 1 0 0 0 0 0 1 0 0 0 0 1
-Seq_Frame0000_ProbeToReferenceTransformStatus = OK
-Seq_Frame0000_Timestamp = 0.0
-Seq_Frame0000_FrameNumber = 0
-Seq_Frame0000_ImageStatus = INVALID
-Seq_Frame0001_ProbeToReferenceTransform = 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1
-Seq_Frame0001_ProbeToReferenceTransformStatus = INVALID
-Seq_Frame0001_Timestamp = 0.3333333333333333
-Seq_Frame0001_FrameNumber = 1
-Seq_Frame0001_ImageStatus = OK
-Seq_Frame0002_ProbeToReferenceTransform = 0 -1 0 20 1 0 0 40 0 0 1 60 0 0 0 1
-Seq_Frame0002_ProbeToReferenceTransformStatus = OK
-Seq_Frame0002_Timestamp = 0.6666666666666666
-Seq_Frame0002_FrameNumber = 2
-Seq_Frame0002_ImageStatus = OK
-ElementDataFile = LOCAL
 """
+    frames = (
+        ("0 -1 0 0 1 0 0 0 0 0 1 0 0 0 0 1", "OK", "0.0", "INVALID"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "INVALID", "0.3333333333333333", "OK"),
+        ("0 -1 0 20 1 0 0 40 0 0 1 60 0 0 0 1", "OK", "0.6666666666666666", "OK"),
     )
-
-
-def test_what_the_writer_wrote_reads_back(tmp_path):
-    sweep = read_sweep(written(tmp_path / "new.igs.mha"))
-    assert np.array_equal(sweep.images, [np.zeros((3, 4)), PIXELS[0] + 1, PIXELS[0] + 2])
-    assert [sweep.is_image_ok(frame) for frame in range(3)] == [False, True, True]
-    assert sweep.transform("Probe", "Reference", 1) is None
-    assert np.array_equal(sweep.transform("Probe", "Reference", 2)[:3, 3], [20, 40, 60])
-    assert np.array_equal(sweep.times_s, [0, 1 / 3, 2 / 3])
+    for number, (matrix, status, time, image) in enumerate(frames):
+        wanted += f"""Seq_Frame000{number}_ProbeToReferenceTransform = {matrix}
+Seq_Frame000{number}_ProbeToReferenceTransformStatus = {status}
+Seq_Frame000{number}_Timestamp = {time}
+Seq_Frame000{number}_FrameNumber = {number}
+Seq_Frame000{number}_ImageStatus = {image}
+"""
+    assert b"".join(lines).decode() == wanted + "ElementDataFile = LOCAL\n"
 
 
 def test_frame_by_frame_and_at_once_give_the_same_bytes(tmp_path):
@@ -365,5 +330,5 @@ def test_whatever_stands_in_a_sweep_comes_back(tmp_path_factory, frames, data):
     write_sweep(path, Sweep(images, frames, {"Note": "a"}))
     again = read_sweep(path)
     assert again.frames == frames
-    assert [list(each) for each in again.frames] == [list(each) for each in frames]
+    assert [list(fields) for fields in again.frames] == [list(fields) for fields in frames]
     assert np.array_equal(again.images, images)

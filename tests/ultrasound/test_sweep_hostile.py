@@ -109,7 +109,7 @@ def test_after_an_exception_all_is_as_before(tmp_path):
 
     with pytest.raises(RuntimeError, match="stop"), SweepWriter(path, {}) as writer:
         list(map(writer.append, images(), [{}, {}]))
-    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
     assert path.read_text() == "what stood here"
 
 
@@ -117,7 +117,7 @@ def test_a_file_that_cannot_be_put_in_place_leaves_nothing(tmp_path):
     (tmp_path / "a.igs.mha").mkdir()
     with pytest.raises(OSError, match="irectory"):
         written(tmp_path / "a.igs.mha")
-    assert [each.name for each in tmp_path.iterdir()] == ["a.igs.mha"]
+    assert [file.name for file in tmp_path.iterdir()] == ["a.igs.mha"]
 
 
 def test_a_sweep_without_frames_is_none(tmp_path):

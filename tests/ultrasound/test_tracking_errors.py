@@ -31,9 +31,9 @@ def reported(errors: TrackingErrors, seed: int = 0) -> np.ndarray:
     return np.array(with_tracking_errors(poses, times, errors, seed))
 
 
-def turns_deg(found: np.ndarray, poses: np.ndarray) -> np.ndarray:
+def turns_deg(reported_poses: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """Rotation vectors (n, 3) from true to found, in the probe's axes."""
-    return Rotation.from_matrix(np.swapaxes(poses[:, :3, :3], 1, 2) @ found[:, :3, :3]).as_rotvec(
+    return Rotation.from_matrix(np.swapaxes(poses[:, :3, :3], 1, 2) @ reported_poses[:, :3, :3]).as_rotvec(
         degrees=True
     )
 
@@ -44,20 +44,13 @@ def test_a_perfect_tracker_reports_the_very_poses():
 
 def test_noise_has_the_deviation_asked_for_on_every_axis_and_no_two_axes_or_frames_go_together():
     poses, _ = sweep()
-    found = reported(TrackingErrors(noise_mm=0.6, noise_deg=0.8))
-    drawn = np.hstack([(found - poses)[:, :3, 3] / 0.6, turns_deg(found, poses) / 0.8])
+    noisy = reported(TrackingErrors(noise_mm=0.6, noise_deg=0.8))
+    drawn = np.hstack([(noisy - poses)[:, :3, 3] / 0.6, turns_deg(noisy, poses) / 0.8])
     # Standard errors of n normal values: deviation 1/sqrt(2n), mean and correlation 1/sqrt(n).
     assert np.abs(drawn.std(axis=0) - 1).max() < SIGMAS / np.sqrt(2 * FRAMES)
     assert np.abs(drawn.mean(axis=0)).max() < SIGMAS / np.sqrt(FRAMES)
     assert np.abs(np.corrcoef(drawn.T) - np.eye(6)).max() < SIGMAS / np.sqrt(FRAMES)
     assert np.abs((drawn[1:] * drawn[:-1]).mean(axis=0)).max() < SIGMAS / np.sqrt(FRAMES)
-
-
-def test_noise_turns_the_probe_about_its_own_origin():
-    poses, _ = sweep()
-    found = reported(TrackingErrors(noise_deg=3.0))
-    np.testing.assert_array_equal(found[:, :3, 3], poses[:, :3, 3])
-    assert np.linalg.norm(turns_deg(found, poses), axis=1).min() > 0
 
 
 def test_noise_turns_about_the_probes_own_axes_whatever_its_pose():
@@ -70,8 +63,8 @@ def test_noise_turns_about_the_probes_own_axes_whatever_its_pose():
 
 def test_calibration_is_one_shift_and_turn_of_the_image_against_the_probe():
     poses, _ = sweep()
-    found = reported(TrackingErrors(calibration_mm=2.5, calibration_deg=4.0))
-    calibration = np.linalg.inv(poses) @ found
+    shifted = reported(TrackingErrors(calibration_mm=2.5, calibration_deg=4.0))
+    calibration = np.linalg.inv(poses) @ shifted
     # Positions are some 1000 mm large, of which float64 keeps 1e-13.
     np.testing.assert_allclose(calibration, np.broadcast_to(calibration[0], poses.shape), atol=1e-11)
     assert np.linalg.norm(calibration[0, :3, 3]) == pytest.approx(2.5, abs=1e-11)
@@ -82,8 +75,10 @@ def test_calibration_is_one_shift_and_turn_of_the_image_against_the_probe():
 
 def test_the_directions_of_calibration_come_from_the_seed():
     errors, (poses, times) = TrackingErrors(calibration_mm=1.0, calibration_deg=1.0), sweep(1)
-    found = np.concatenate([np.array(with_tracking_errors(poses, times, errors, seed)) for seed in range(30)])
-    shifts, axes = (found - poses)[:, :3, 3], turns_deg(found, poses)
+    shifted = np.concatenate(
+        [np.array(with_tracking_errors(poses, times, errors, seed)) for seed in range(30)]
+    )
+    shifts, axes = (shifted - poses)[:, :3, 3], turns_deg(shifted, poses)
     # Of n directions the mean is 0, each of its coordinates with a standard error of 1 / sqrt(3 n).
     assert np.abs([shifts.mean(axis=0), axes.mean(axis=0)]).max() < SIGMAS / np.sqrt(3 * 30)
     assert np.abs((shifts @ poses[0, :3, :3] * axes).sum(axis=1).mean()) < SIGMAS / np.sqrt(3 * 30)
@@ -99,18 +94,18 @@ def test_calibration_comes_after_noise():
 
 def test_latency_is_the_pose_of_so_much_earlier():
     poses, times = sweep()
-    found, latency = reported(TrackingErrors(latency_s=0.073)), 0.073
+    late_poses, latency = reported(TrackingErrors(latency_s=0.073)), 0.073
     # Motion and turn are uniform, so that interpolation is exact; those before are the first.
     late = times - times[0] > latency
     np.testing.assert_allclose(
-        (poses - found)[late, :3, 3], np.tile(latency * np.array([10, -20, 5]), (late.sum(), 1))
+        (poses - late_poses)[late, :3, 3], np.tile(latency * np.array([10, -20, 5]), (late.sum(), 1))
     )
     axis = np.array([2, 1, 2]) / 3
     np.testing.assert_allclose(
-        turns_deg(found, poses)[late], np.tile(-40 * latency * axis, (late.sum(), 1)), atol=1e-9
+        turns_deg(late_poses, poses)[late], np.tile(-40 * latency * axis, (late.sum(), 1)), atol=1e-9
     )
     assert np.count_nonzero(~late) == 4
-    np.testing.assert_allclose(found[~late], np.broadcast_to(poses[0], (4, 4, 4)), atol=1e-13)
+    np.testing.assert_allclose(late_poses[~late], np.broadcast_to(poses[0], (4, 4, 4)), atol=1e-13)
 
 
 def test_a_single_pose_has_nothing_earlier():
@@ -120,28 +115,24 @@ def test_a_single_pose_has_nothing_earlier():
     )
 
 
-@pytest.mark.parametrize("lost", [0.03, 0.4])
+@pytest.mark.parametrize("lost", [0.03, 0.4, 1.0])
 def test_the_share_of_lost_frames_is_that_asked_for(lost):
     poses, times = sweep()
     gone = np.array([pose is None for pose in with_tracking_errors(poses, times, TrackingErrors(lost=lost))])
     # The standard error of a share of n independent frames.
-    assert abs(gone.mean() - lost) < SIGMAS * np.sqrt(lost * (1 - lost) / FRAMES)
+    assert abs(gone.mean() - lost) <= SIGMAS * np.sqrt(lost * (1 - lost) / FRAMES)
     # In a row as often as chance has it, whose standard error is at most that of so many pairs.
     assert abs((gone[1:] & gone[:-1]).mean() - lost**2) < 2 * SIGMAS * lost / np.sqrt(FRAMES)
 
 
-def test_all_frames_can_be_lost():
-    assert with_tracking_errors(*sweep(50), TrackingErrors(lost=1.0)) == [None] * 50
-
-
 def test_what_is_reported_is_rigid():
-    found = reported(EVERYTHING)
-    rotation = found[:, :3, :3]
+    noisy = reported(EVERYTHING)
+    rotation = noisy[:, :3, :3]
     np.testing.assert_allclose(
         rotation @ np.swapaxes(rotation, 1, 2), np.tile(np.eye(3), (FRAMES, 1, 1)), atol=1e-12
     )
     assert (np.linalg.det(rotation) > 0).all()
-    np.testing.assert_array_equal(found[:, 3], np.tile([0, 0, 0, 1], (FRAMES, 1)))
+    np.testing.assert_array_equal(noisy[:, 3], np.tile([0, 0, 0, 1], (FRAMES, 1)))
 
 
 def test_a_seed_gives_the_same_poses_and_another_gives_others():
@@ -152,8 +143,8 @@ def test_a_seed_gives_the_same_poses_and_another_gives_others():
 def test_a_seed_draws_one_pattern_at_any_size_and_whatever_is_lost():
     poses, times = sweep()
     small = reported(TrackingErrors(noise_mm=0.1)) - poses
-    found = with_tracking_errors(poses, times, TrackingErrors(noise_mm=0.8, lost=0.3))
-    for pose, true, step in zip(found, poses, small, strict=True):
+    large = with_tracking_errors(poses, times, TrackingErrors(noise_mm=0.8, lost=0.3))
+    for pose, true, step in zip(large, poses, small, strict=True):
         if pose is not None:
             np.testing.assert_allclose((pose - true)[:3, 3], 8 * step[:3, 3], atol=1e-11)
 
