@@ -13,8 +13,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict
 from scipy.spatial.transform import Rotation
 
-from rehearsal.case import case_of
-from rehearsal.configuration import with_quality
+from rehearsal.configuration import probe_of, with_quality
 from rehearsal.planning.sweep_score import score
 from rehearsal.planning.sweep_trial import PlanningProblem, Trial
 from scenes.anatomy import load_anatomy
@@ -54,9 +53,9 @@ class ProbeEnvironment(gymnasium.Env[Observation, np.ndarray]):
         loaded = with_quality(load_scene(path), quality)
         anatomy = load_anatomy(loaded, path.parent)
         start("cpu")
-        probe = case_of(loaded, anatomy).probe
-        self._trial = Trial(PlanningProblem(loaded, anatomy, probe, target, 5.0, loaded.trocar))
-        self._rehearsal, self._actions, self._shape = self._trial.rehearsal, actions, (pixels, pixels)
+        self.problem = PlanningProblem(loaded, anatomy, probe_of(loaded), target, 5.0, loaded.trocar)
+        self.trial = Trial(self.problem)
+        self._rehearsal, self._actions, self._shape = self.trial.rehearsal, actions, (pixels, pixels)
         self.action_space = Box(-1.0, 1.0, (6,), np.float32)
         self.observation_space: Any = Dict(
             image=Box(0, 255, self._shape, np.uint8),
@@ -70,7 +69,7 @@ class ProbeEnvironment(gymnasium.Env[Observation, np.ndarray]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode, just touching the organ at a random place."""
         super().reset(seed=seed)
-        trial, manipulator = self._trial, self._trial.manipulator
+        trial, manipulator = self.trial, self.trial.manipulator
         trial.begin(SPEED_MM_S)
         manipulator.state = ManipulatorState()
         manipulator.slide(*self.np_random.uniform(-BEGINS_WITHIN_MM, BEGINS_WITHIN_MM, 2))
@@ -83,7 +82,7 @@ class ProbeEnvironment(gymnasium.Env[Observation, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Move the transducer, no deeper than the manipulator allows; see ``gymnasium.Env.step``."""
         pose = self._rehearsal.organ.pose
-        self._trial.move(pose, self._goal(pose, np.clip(np.asarray(action, float), -1.0, 1.0)))
+        self.trial.move(pose, self._goal(pose, np.clip(np.asarray(action, float), -1.0, 1.0)))
         before, terms = self._score, self._measured()
         is_over = len(self._poses) > self._actions
         return self._observation(), self._score - before, False, is_over, {"seen": terms.seen}
@@ -97,7 +96,7 @@ class ProbeEnvironment(gymnasium.Env[Observation, np.ndarray]):
         return action / max(np.abs(action).max(), 1.0)
 
     def _goal(self, pose: np.ndarray, action: np.ndarray) -> np.ndarray:
-        length_mm, manipulator = self._rehearsal.case.size_mm[2], self._trial.manipulator
+        length_mm, manipulator = self._rehearsal.case.size_mm[2], self.trial.manipulator
         turn = Rotation.from_rotvec(MOST_DEG * action[3:], degrees=True).as_matrix()
         goal = pose.copy()
         goal[:3, :3] = pose[:3, :3] @ turn
@@ -107,9 +106,9 @@ class ProbeEnvironment(gymnasium.Env[Observation, np.ndarray]):
 
     def _measured(self) -> Any:
         """The terms of the path so far, with the present pose."""
-        self._trial.measure()
+        self.trial.measure()
         self._poses.append(self._rehearsal.organ.pose)
-        terms = self._trial.so_far([np.stack(self._poses)])
+        terms = self.trial.so_far([np.stack(self._poses)])
         self._score = score(terms)
         return terms
 

@@ -58,6 +58,10 @@ STUDIES = {
         "studies.planning.plan_comparison:plan_study",
         "Compare planned sweeps with straight and random ones.",
     ),
+    "gymnasium": (
+        "studies.planning.environment_comparison:gymnasium_study",
+        "Follow planned, straight and random sweeps in the Gymnasium environment.",
+    ),
 }
 
 

@@ -15,6 +15,7 @@ from errors import UserError
 from rehearsal.gymnasium_environment import MOST_DEG, MOST_MM, ProbeEnvironment
 from rehearsal.rehearsal import open_rehearsal
 from studies.planning.baseline_sweeps import random_sweep, straight
+from studies.planning.environment_comparison import followed
 from ultrasound.probe_manipulator import array_face_centre
 
 pytestmark = pytest.mark.usefixtures("arrays_stored")
@@ -81,22 +82,12 @@ def test_an_action_is_made_along_and_about_the_axes_of_the_transducer(environmen
         assert turned == pytest.approx(MOST_DEG * action[3:], abs=1e-6)
 
 
-def followed(environment: ProbeEnvironment, passes: list[np.ndarray]) -> tuple[float, float]:
-    """The sum of the rewards, and the coverage, of a sweep whose poses (n, 4, 4) are gone to one by one."""
-    environment.reset(seed=1)
-    total, info = 0.0, {"seen": 0.0}
-    for goal in np.concatenate(passes)[::3]:
-        while np.abs(action := environment.action_towards(goal)).max() > 0.02:
-            _, reward, _, _, info = environment.step(action)
-            total += reward
-    return total, info["seen"]
-
-
 def test_a_straight_sweep_over_the_tumour_scores_more_than_a_random_one(environment):
-    trial = environment._trial
-    straight_score, seen = followed(environment, straight(trial))
-    assert seen > 0.6 and straight_score > 50.0
-    assert straight_score > followed(environment, random_sweep(trial, 1, seed=0))[0]
+    passes = straight(environment.trial)
+    figures = followed(environment, [one[::3] for one in passes])
+    assert figures["covered_percent"] > 60.0 and figures["rewards"] > 50.0
+    by_chance = random_sweep(environment.trial, 1, seed=0)
+    assert figures["rewards"] > followed(environment, [one[::3] for one in by_chance])["rewards"]
 
 
 def test_environments_run_in_parallel():
