@@ -50,8 +50,9 @@ class SweepVolumes:
 
 def image_poses_of(sweep: Sweep, reference: str) -> ImagePoses:
     """The poses of a sweep's images in a coordinate system. Raises SweepError where no image has one."""
-    poses = {frame: sweep.transform("Image", reference, frame) for frame in range(len(sweep))}
-    usable = {frame: pose for frame, pose in poses.items() if pose is not None and sweep.is_image_ok(frame)}
+    frames = filter(sweep.is_image_ok, range(len(sweep)))
+    poses = {frame: sweep.transform("Image", reference, frame) for frame in frames}
+    usable = {frame: pose for frame, pose in poses.items() if pose is not None}
     if not usable:
         raise SweepError(
             f"no image with a valid pose in {reference}, of {len(sweep)} frames: expected status OK in some"
