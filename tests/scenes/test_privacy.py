@@ -125,12 +125,10 @@ def test_no_file_names_the_patient_and_no_sentence_is_garbled(source, shown, tmp
 @pytest.mark.parametrize(
     ("name", "is_written"),
     [
-        ("kidney_left", True), ("Renal mass "
-            "2", True), ("BODY", True), ("vertebrae_L1", True), ("GTV_PRV5", True),
-        ("Niere links", True), ("kidneyL", True), ("portal_vein_and_splenic_vein", True), ("", True),
-        ("Mr L", False),
-        ("Doe_left", False), ("GTV "
-            "Doe", False), ("kidney 19600229", False), ("Carter kidney", False), ("Harnisch", False),
+        ("kidney_left", True), ("Renal mass 2", True), ("BODY", True), ("vertebrae_L1", True),
+        ("GTV_PRV5", True), ("Niere links", True), ("kidneyL", True), ("portal_vein_and_splenic_vein", True),
+        ("", True), ("Mr L", False), ("Doe_left", False), ("GTV Doe", False), ("kidney 19600229", False),
+        ("Carter kidney", False), ("Harnisch", False), ("kidney^left", False),
     ],
 )  # fmt: skip
 def test_names_of_structures_alone_are_written(name, is_written):
