@@ -22,8 +22,10 @@ ORIENTATION_FIELDS = {"transformmatrix", "rotation", "orientation"}
 # Those that the format has, and their abbreviations (teem.sourceforge.net/nrrd/format.html#space).
 SPACES_OF_NRRD = {
     *("right-anterior-superior", "ras", "left-anterior-superior", "las", "left-posterior-superior", "lps"),
-    *("right-anterior-superior-time", "rast", "left-anterior-superior-time", "last", "left-posterior-superior-time", "lpst"),
-    *("scanner-xyz", "scanner-xyz-time", "3d-right-handed", "3d-left-handed", "3d-right-handed-time", "3d-left-handed-time"),
+    *("right-anterior-superior-time", "rast", "left-anterior-superior-time", "last",
+    "left-posterior-superior-time", "lpst"),
+    *("scanner-xyz", "scanner-xyz-time", "3d-right-handed", "3d-left-handed", "3d-right-handed-time",
+    "3d-left-handed-time"),
 }  # fmt: skip
 HEADER_BYTES, LINE_BYTES, NAME_LETTERS = 1 << 22, 1 << 16, 255
 

@@ -11,15 +11,18 @@ from test_readers_labels import by_name, ct_grid
 from scenes.patients.readers.label_files import open_labels
 
 NOT_NEEDED = [
-    "StudyInstanceUID", "FrameOfReferenceUID", "ContentLabel", "DimensionOrganizationSequence", "DimensionIndexSequence",
+    "StudyInstanceUID", "FrameOfReferenceUID", "ContentLabel", "DimensionOrganizationSequence",
+    "DimensionIndexSequence",
     "ReferencedSeriesSequence", "ReferencedSeriesSequence.SeriesInstanceUID",
     "ReferencedSeriesSequence.ReferencedInstanceSequence.ReferencedSOPInstanceUID",
     "SegmentSequence.SegmentAlgorithmType", "SegmentSequence.SegmentAlgorithmName",
-    "SegmentSequence.SegmentedPropertyCategoryCodeSequence", "SegmentSequence.SegmentedPropertyTypeCodeSequence",
+    "SegmentSequence.SegmentedPropertyCategoryCodeSequence",
+    "SegmentSequence.SegmentedPropertyTypeCodeSequence",
     "SegmentSequence.SegmentedPropertyTypeCodeSequence.CodeMeaning",
     "SharedFunctionalGroupsSequence.PixelMeasuresSequence.SliceThickness",
     "SharedFunctionalGroupsSequence.PixelMeasuresSequence.SpacingBetweenSlices",
-    "PerFrameFunctionalGroupsSequence.FrameContentSequence", "PerFrameFunctionalGroupsSequence.DerivationImageSequence",
+    "PerFrameFunctionalGroupsSequence.FrameContentSequence",
+    "PerFrameFunctionalGroupsSequence.DerivationImageSequence",
     "PerFrameFunctionalGroupsSequence.FrameContentSequence.DimensionIndexValues",
     "PerFrameFunctionalGroupsSequence.DerivationImageSequence.SourceImageSequence.ReferencedSOPInstanceUID",
     "SamplesPerPixel", "PhotometricInterpretation", "PixelRepresentation", "BitsStored", "NumberOfFrames",

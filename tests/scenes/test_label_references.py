@@ -28,19 +28,16 @@ def references(text):
 @pytest.mark.parametrize(
     ("labels", "fault", "doubt"),
     [
-        ("F S 12 "
-         "A", "", ""), ("F S 12 "
-            "B", "", ""), (". S . .", "", ""), (". . 3 .", "", ""), (". . . .", "", ""), (". . . A", "", ""),
+        ("F S 12 A", "", ""), ("F S 12 B", "", ""), (". S . .", "", ""), (". . 3 .", "", ""),
+        (". . . .", "", ""), (". . . A", "", ""),
         ("F T 78 A", "", "another series of this CT's frame"), ("F . . B", "", "another patient ID"),
-        ("G S 12 "
-         "A", "", "another frame of "
-            "reference"), ("G . 2 A", "", "another frame of reference"), (". T 2 .", "", ""),
+        ("G S 12 A", "", "another frame of reference"), ("G . 2 A", "", "another frame of reference"),
+        (". T 2 .", "", ""),
         ("G T 78 A", "another frame of reference", ""), ("G . . A", "another frame of reference", ""),
-        (". T . "
-         "A", "another series", ""), (". T 78 .", "another series", ""), (". . 78 .", "another series", ""),
-        ("F T 78 "
-         "B", "another patient ID, and refer to another "
-            "series", ""), (". . . B", "another patient ID, and no frame", ""),
+        (". T . A", "another series", ""), (". T 78 .", "another series", ""),
+        (". . 78 .", "another series", ""),
+        ("F T 78 B", "another patient ID, and refer to another series", ""),
+        (". . . B", "another patient ID, and no frame", ""),
     ],
 )  # fmt: skip
 def test_what_belongs_to_a_ct(labels, fault, doubt):

@@ -27,14 +27,14 @@ from scenes.patients.readers.label_maps import NEAR_MM
 from scenes.patients.readers.segment_names import is_needless
 
 NEEDLESS = [
-    "BODY", "Body", "External", "external_1", "Skin", "Patient", "Patient "
-            "outline", "Outer Contour", "Body contour", "whole body",
-    "CouchSurface", "CouchInterior", "Z_Couch", "Table", "table "
-            "top", "Mattress", "heart", "lung_left", "femur_right",
+    "BODY", "Body", "External", "external_1", "Skin", "Patient", "Patient outline", "Outer Contour",
+    "Body contour", "whole body",
+    "CouchSurface", "CouchInterior", "Z_Couch", "Table", "table top", "Mattress", "heart", "lung_left",
+    "femur_right",
 ]  # fmt: skip
 NEEDED = [
-    "kidney_left", "GTV", "vertebral body "
-            "L1", "external oblique muscle", "body of pancreas", "spleen", "Segment_1", "skin metastasis",
+    "kidney_left", "GTV", "vertebral body L1", "external oblique muscle", "body of pancreas", "spleen",
+    "Segment_1", "skin metastasis",
     "stable lesion", "unknown", "aorta", "patient's cyst",
 ]  # fmt: skip
 
@@ -217,7 +217,8 @@ class TestSyntaxes:
     @pytest.mark.parametrize(
         "syntax",
         [
-            ImplicitVRLittleEndian, ExplicitVRBigEndian, DeflatedExplicitVRLittleEndian, RLELossless, JPEG2000Lossless, JPEGLSLossless,
+            ImplicitVRLittleEndian, ExplicitVRBigEndian, DeflatedExplicitVRLittleEndian, RLELossless,
+            JPEG2000Lossless, JPEGLSLossless,
         ],
     )  # fmt: skip
     def test_are_decoded(self, drawn, kind, syntax):
@@ -274,7 +275,8 @@ def as_bytes(data, syntax):
 
     packed = {
         RLELossless: lambda frame: RLELosslessEncoder.encode(
-            frame, rows=frame.shape[0], columns=frame.shape[1], samples_per_pixel=1, bits_allocated=8, bits_stored=8,
+            frame, rows=frame.shape[0], columns=frame.shape[1], samples_per_pixel=1, bits_allocated=8,
+            bits_stored=8,
             number_of_frames=1, photometric_interpretation="MONOCHROME2", pixel_representation=0,
         ),
         JPEG2000Lossless: lambda frame: encode_array(frame, bits_stored=8),

@@ -358,7 +358,8 @@ class TestRefused:
     @pytest.mark.parametrize(
         "name",
         [
-            "PixelSpacing", "ImagePositionPatient", "ImageOrientationPatient", "RescaleSlope", "RescaleIntercept", "InstanceNumber",
+            "PixelSpacing", "ImagePositionPatient", "ImageOrientationPatient", "RescaleSlope",
+            "RescaleIntercept", "InstanceNumber",
             "NumberOfFrames",
         ],
     )  # fmt: skip

@@ -256,12 +256,12 @@ class TestFiles:
         [
             "ElementDataFile = ../x.raw", "ElementDataFile = {outside}/x.raw", "ElementDataFile: ../x.raw",
             "Comment = a\x85ElementDataFile = LOCAL\nElementDataFile = ../x.raw",
-            "Comment = a\rElementDataFile = LOCAL\nElementDataFile = "
-            "../x.raw", "\n\nElementDataFile = ../x.raw",
-            "{long}ElementDataFile = "
-            "../x.raw", "ElementDataFile = LIST\n../x.raw", "ElementDataFile = x%d.raw 1 6 1",
-            "BinaryData = True ElementDataFile = "
-            "../x.raw", "ElementDataFile = a\0b", "ElementDataFile = {name}", "ElementDataFile = link.raw",
+            "Comment = a\rElementDataFile = LOCAL\nElementDataFile = ../x.raw",
+            "\n\nElementDataFile = ../x.raw",
+            "{long}ElementDataFile = ../x.raw", "ElementDataFile = LIST\n../x.raw",
+            "ElementDataFile = x%d.raw 1 6 1",
+            "BinaryData = True ElementDataFile = ../x.raw", "ElementDataFile = a\0b",
+            "ElementDataFile = {name}", "ElementDataFile = link.raw",
         ],
     )  # fmt: skip
     def test_voxels_of_metaimage_elsewhere(self, tmp_path, refused, ending, line):
@@ -275,8 +275,8 @@ class TestFiles:
     @pytest.mark.parametrize(
         "line",
         [
-            "data file: "
-            "../x.raw", "datafile: {outside}/x.raw", "Data File:../x.raw", "data file: LIST\n../x.raw",
+            "data file: ../x.raw", "datafile: {outside}/x.raw", "Data File:../x.raw",
+            "data file: LIST\n../x.raw",
             "data file: ../x%d.raw 1 6 1", "# a\x85data file: in.raw\ndata file: ../x.raw",
             "# {name}\ndata file: ../x.raw", "data file: a\0b", "data file: link.raw",
         ],

@@ -30,17 +30,16 @@ NAMES = {
     "Niere links": ("kidney", "left"), "Niere rechts": ("kidney", "right"), "Rein gauche": ("kidney", "left"),
     "left renal mass": ("tumour", "left"), "GTV": ("tumour", None), "GTV_L": ("tumour", "left"),
     "Renal Tumor": ("tumour", None), "tumour": ("tumour", None), "ccRCC right": ("tumour", "right"),
-    "Tumor Niere "
-    "links": ("tumour", "left"), "kidney_lesion": ("tumour", None), "kidney_cyst_left": ("cyst", "left"),
+    "Tumor Niere links": ("tumour", "left"), "kidney_lesion": ("tumour", None),
+    "kidney_cyst_left": ("cyst", "left"),
     "Renal cyst": ("cyst", None), "adrenal_gland_left": (None, "left"), "gallbladder": (None, None),
     "renal vein left": ("vein", "left"), "Renal artery R": ("artery", "right"), "aorta": ("artery", None),
-    "renal arteries and "
-    "veins": ("vessel", None), "blood "
-            "vessels": ("vessel", None), "inferior_vena_cava": ("vein", None), "ureter_right": ("urine", "right"), "Renal "
-            "pelvis": ("urine", None),
+    "renal arteries and veins": ("vessel", None), "blood vessels": ("vessel", None),
+    "inferior_vena_cava": ("vein", None), "ureter_right": ("urine", "right"), "Renal pelvis": ("urine", None),
     "renal_cortex": ("cortex", None), "renal sinus fat": ("sinus", None), "liver": ("liver", None),
     "rib_left_11": ("bone", "left"), "vertebrae_L1": ("bone", None), "hip_left": ("bone", "left"),
-    "spleen": ("spleen", None), "Segment_1": (None, None), "colon": (None, None), "iliopsoas_right": ("muscle", "right"),
+    "spleen": ("spleen", None), "Segment_1": (None, None), "colon": (None, None),
+    "iliopsoas_right": ("muscle", "right"),
 }  # fmt: skip
 KIDNEY = np.array([-28.0, 24.0, -393.0]), np.array([3.0, 2.5, 5.0])
 TUMOUR = np.array([-26.5, 24.5, -391.0]), np.array([1.6, 1.4, 2.6])
@@ -144,8 +143,8 @@ class TestLabelMaps:
         ("voxels", "words"),
         [
             (np.full((4, 4, 4), 0.5, np.float32), "probability"), (np.zeros((4, 4, 4), np.uint8), "is empty"),
-            (np.full((4, 4, 4), -1000, np.int16), "exchanged"), (np.full((4, 4, 4), 70_000, np.int32), "whole "
-            "numbers"),
+            (np.full((4, 4, 4), -1000, np.int16), "exchanged"),
+            (np.full((4, 4, 4), 70_000, np.int32), "whole numbers"),
             (np.full((4, 4, 4), np.nan, np.float32), "finite"),
         ],
     )  # fmt: skip
@@ -278,7 +277,8 @@ class TestSegmentations:
         ("labels", "plain", "values"),
         [
             ("liver.dcm", "liver_seg.nrrd", {1: 1}),
-            ("24x38x3/seg", "24x38x3/nrrd/label.nrrd", {1: 1}), ("23x38x3/seg", "23x38x3/nrrd/label.nrrd", {1: 1}),
+            ("24x38x3/seg", "24x38x3/nrrd/label.nrrd", {1: 1}),
+            ("23x38x3/seg", "23x38x3/nrrd/label.nrrd", {1: 1}),
             ("partial_overlaps.dcm", "partial_overlaps-1.nrrd", {1: 1, 4: 4, 5: 5}),
             ("partial_overlaps.dcm", "partial_overlaps-2.nrrd", {2: 2}),
             ("partial_overlaps.dcm", "partial_overlaps-3.nrrd", {3: 3}),

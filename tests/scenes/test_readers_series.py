@@ -49,13 +49,15 @@ class TestUnevenGaps:
 
     @pytest.mark.parametrize(
         "gaps",
-        [(5, 7, 5, 7, 5), (7, 7, 5, 7, 7), (5, 6, 7, 5.5, 6.5), (2.5, 3.5, 2.5, 3.5, 3.5), (5.02, 6.97, 5, 7.04, 6.99)],
+        [(5, 7, 5, 7, 5), (7, 7, 5, 7, 7), (5, 6, 7, 5.5, 6.5), (2.5, 3.5, 2.5, 3.5, 3.5),
+        (5.02, 6.97, 5, 7.04, 6.99)],
         ids=str,
     )  # fmt: skip
     def test_nothing_finer_is_lost(self, tmp_path, gaps):
         at = np.concatenate([[0.0], np.cumsum(gaps)])
         series = Series(
-            tmp_path, DIRECTIONS["identity"], field=lambda places: np.interp(places[..., 2], at, [0, 900] * 3),
+            tmp_path, DIRECTIONS["identity"], field=lambda places: np.interp(places[..., 2], at, [0,
+            900] * 3),
             positions=lambda k: np.array([0, 0, at[k]]),
         )  # fmt: skip
         volume, voxels = read_ct(series.write((3, 0, 5, 1, 4, 2)))
@@ -98,8 +100,10 @@ class TestSpacings:
     @pytest.mark.parametrize(
         ("gaps", "spacings"),
         [
-            ([5.0] * 6 + [2.5] * 6, ("5.00", "2.50")), ([1.5] * 9 + [5.0] * 4, ("1.50", "5.00")), ([1.5] * 4 + [5.0] * 9, ("1.50", "5.00")),
-            ([2.5] * 6 + [4.0] + [5.0] * 4, ("2.50", "5.00")), ([5.0, 5.0, 5.0, 1.0, 1.0, 1.0, 1.0, 5.0, 5.0, 5.0], ("5.00", "1.00", "5.00")),
+            ([5.0] * 6 + [2.5] * 6, ("5.00", "2.50")), ([1.5] * 9 + [5.0] * 4, ("1.50", "5.00")),
+            ([1.5] * 4 + [5.0] * 9, ("1.50", "5.00")),
+            ([2.5] * 6 + [4.0] + [5.0] * 4, ("2.50", "5.00")),
+            ([5.0, 5.0, 5.0, 1.0, 1.0, 1.0, 1.0, 5.0, 5.0, 5.0], ("5.00", "1.00", "5.00")),
             ([1.3, 1.2, 1.3, 1.2, 5.0, 5.0, 5.0], ("1.25", "5.00")),
         ],
     )  # fmt: skip

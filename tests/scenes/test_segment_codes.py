@@ -35,17 +35,16 @@ CODES = {
     "mass of the right kidney": (ALTERED, MASS, NONE, KIDNEY, RIGHT_CODE, "tumour", {"right"}),
     "mass of no region": (ALTERED, MASS, NONE, NONE, NONE, "tumour", set()),
     "mass of the liver": (ALTERED, MASS, NONE, "SCT^10200004^Liver", NONE, None, set()),
-    "cyst of the adrenal "
-    "gland": (ALTERED, CYST, NONE, "SCT^23451007^Adrenal gland", LEFT_CODE, None, {"left"}),
+    "cyst of the adrenal gland": (ALTERED, CYST, NONE, "SCT^23451007^Adrenal gland", LEFT_CODE, None,
+    {"left"}),
     "cyst of the kidney": (ALTERED, CYST, LEFT_CODE, KIDNEY, LEFT_CODE, "cyst", {"left"}),
     "renal artery": (STRUCTURE, "SCT^2841007^Renal artery", RIGHT_CODE, NONE, NONE, "artery", {"right"}),
     "artery of the kidney": (STRUCTURE, "SCT^51114001^Artery", NONE, KIDNEY, NONE, "artery", set()),
     "renal pelvis": (STRUCTURE, "SCT^25990002^Renal pelvis", NONE, NONE, NONE, "urine", set()),
     "spleen": (STRUCTURE, "SCT^78961009^Spleen", NONE, NONE, NONE, "spleen", set()),
     "both kidneys": (STRUCTURE, KIDNEY, BOTH, NONE, NONE, "kidney", set()),
-    "in "
-    "German": (STRUCTURE, "SCT^64033007^Organ der "
-            "Harnbildung", "SCT^7771000^li.", NONE, NONE, "kidney", {"left"}),
+    "in German": (STRUCTURE, "SCT^64033007^Organ der Harnbildung", "SCT^7771000^li.", NONE, NONE, "kidney",
+    {"left"}),
     "unknown code, known words": (STRUCTURE, "FMA^7205^Left kidney", NONE, NONE, NONE, "kidney", {"left"}),
     "another scheme's number": (STRUCTURE, "FMA^64033007^Femur", NONE, NONE, NONE, "bone", set()),
     "SNOMED RT": ("SRT^T-D0050^Tissue", "SRT^T-71000^", "SRT^G-A100^", NONE, NONE, "kidney", {"right"}),

@@ -123,7 +123,8 @@ class TestCopies:
         assert ndimage.label(one.values)[1] == 1
 
     @pytest.mark.parametrize(
-        ("name", "kind"), [("aorta", "CLOSED_PLANAR"), ("aorta", "CLOSEDPLANAR_XOR"), ("Kidney", "CLOSEDPLANAR_XOR")]
+        ("name", "kind"), [("aorta", "CLOSED_PLANAR"), ("aorta", "CLOSEDPLANAR_XOR"),
+        ("Kidney", "CLOSEDPLANAR_XOR")]
     )  # fmt: skip
     @pytest.mark.parametrize(
         ("radius", "inner", "aside"), [(20.0, 10.0, 0.0), (20.0, 19.2, 0.0), (20.0, 19.0, 0.9), (2.5, 1.5, 0)]
@@ -154,7 +155,8 @@ class TestCopies:
         """Nearly the same outline, but for what the region is: only the bump."""
         low, high = (10.4, 10.4), (50.4, 50.4)
         bumpy = np.insert(
-            box(6.0, low, high), 2, [[50.4, 20.4, 6], [50.4 + width, 20.4, 6], [50.4 + width, 26.4, 6], [50.4, 26.4, 6]], axis=0
+            box(6.0, low, high), 2, [[50.4, 20.4, 6], [50.4 + width, 20.4, 6], [50.4 + width, 26.4, 6],
+            [50.4, 26.4, 6]], axis=0
         )  # fmt: skip
         contours = [c + [0, 0, z] for z in (0, 3.0) for c in (bumpy, box(6.0, low, high))]
         one, notes = single(tmp_path, grid_of(3.0), contours, "aorta")

@@ -36,7 +36,8 @@ TAGS = [
     "StudyInstanceUID",
 ]  # fmt: skip
 IDENTIFYING = (
-    "SOPClassUID", "Modality", "SeriesInstanceUID", "SeriesNumber", "FrameOfReferenceUID", "PatientID", "StudyInstanceUID",
+    "SOPClassUID", "Modality", "SeriesInstanceUID", "SeriesNumber", "FrameOfReferenceUID", "PatientID",
+    "StudyInstanceUID",
 )  # fmt: skip
 MODALITY = re.compile("[A-Z]{2,8}")
 # Values of ImageType of screen saves and dose reports, which may be in the series of their CT.
@@ -44,7 +45,8 @@ PAGES = {"SCREEN SAVE", "DOSE_INFO"}
 # Words in values of ImageType of images that were computed from the slices of a CT, such as CT_SOM5 MIP or
 # CURVED MPR.
 COMPUTED = frozenset({
-    "MIP", "MINIP", "MAXIP", "IP", "AVERAGE", "AVG", "PROJECTION", "REFORMATTED", "MPR", "CPR", "CURVED", "VRT", "VR", "SSD", "RENDER",
+    "MIP", "MINIP", "MAXIP", "IP", "AVERAGE", "AVG", "PROJECTION", "REFORMATTED", "MPR", "CPR", "CURVED",
+    "VRT", "VR", "SSD", "RENDER",
     "RENDERED", "RENDERING",
 })  # fmt: skip
 LOCALIZERS = {"LOCALIZER", "SCOUT", "TOPOGRAM"}

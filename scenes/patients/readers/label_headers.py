@@ -18,11 +18,13 @@ LEADING = (
 )  # fmt: skip
 # Where only the contours or frames name the slices.
 OF_EACH = (
-    "ROIContourSequence", "ContourSequence", "PerFrameFunctionalGroupsSequence", "SharedFunctionalGroupsSequence",
+    "ROIContourSequence", "ContourSequence", "PerFrameFunctionalGroupsSequence",
+    "SharedFunctionalGroupsSequence",
     "DerivationImageSequence", *IMAGES,
 )  # fmt: skip
 LABEL_TAGS = [
-    "PatientID", "StudyInstanceUID", "FrameOfReferenceUID", "SegmentSequence", "StructureSetROISequence", *LEADING,
+    "PatientID", "StudyInstanceUID", "FrameOfReferenceUID", "SegmentSequence", "StructureSetROISequence",
+    *LEADING,
 ]  # fmt: skip
 
 

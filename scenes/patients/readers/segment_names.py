@@ -17,7 +17,8 @@ Side = Literal["left", "right"]
 TISSUE_OF_NAME: tuple[tuple[str, str], ...] = (
     ("", r"adrenal|suprarenal|gall ?bladder|cystic "
          r"duct|spleen|splen|milz|\bbazo\b|pancrea|stomach|colon|bowel|duoden|intestin|diaphragm|lymph(?!om)|skin|\bbody\b|external"),
-    ("tumour", r"tum(o|ou|eu)r|\bmass(es|e|a)?\b|\bmasas?\b|raumforderung|l(e|a|ae)sion|lesao|lesoes|laesie|neoplas|neoform|neubild|geschwulst|carcino|karzin|cancer|cancro|krebs|malign|"
+    ("tumour",
+    r"tum(o|ou|eu)r|\bmass(es|e|a)?\b|\bmasas?\b|raumforderung|l(e|a|ae)sion|lesao|lesoes|laesie|neoplas|neoform|neubild|geschwulst|carcino|karzin|cancer|cancro|krebs|malign|"
                r"sar[ck]om|blastom|lymphom|metasta|adenom|nodul|knoten|nephrom|angiomyolip|\bamls?\b|on[ck]o[cz]yt|\b(cc|p|ch|nc)?rcc\b|\bgtv|肿瘤|腫瘍|腫瘤|肿块"),
     ("cyst", r"\bcysts?\b|zyste|\bkystes?\b|\bquistes?\b|\bcisti\b|\bcistos?\b|\bcysten?\b|bosniak|囊肿|嚢胞"),
     ("stone", r"\bstones?\b|calcul|lithiasis|litiasi|nierenstein|\bpiedras?\b|结石|結石"),
@@ -32,9 +33,11 @@ TISSUE_OF_NAME: tuple[tuple[str, str], ...] = (
     ("fat", r"(peri|para)(renal|nephric) fat"),
     ("", r"fascia|gerota|(peri|para)(renal|nephr)|(kidney|renal|nephrectomy) "
          r"(bed|capsule|hilum|hilus|space)\b"),
-    ("kidney", r"kidneys?\b|\brenal\b|\bren\b|\brene\b|\breni\b|\brenes\b|\bniere|\bnier\b|\breins?\b|\brinon(es)?\b|\brim (direito|esquerdo)\b|\brins\b|肾|腎"),
+    ("kidney",
+    r"kidneys?\b|\brenal\b|\bren\b|\brene\b|\breni\b|\brenes\b|\bniere|\bnier\b|\breins?\b|\brinon(es)?\b|\brim (direito|esquerdo)\b|\brins\b|肾|腎"),
     ("liver", r"\bliver\b|hepat|\bleber\b|\bfoie\b|\bhigado\b|\bfigado\b|\bfegato\b|肝"),
-    ("bone", r"vertebr|\bribs?\b|\bbones?\b|\bspine\b|sacrum|\bhip\b|femur|sternum|scapula|humerus|clavicula|costal|knochen|wirbel"),
+    ("bone",
+    r"vertebr|\bribs?\b|\bbones?\b|\bspine\b|sacrum|\bhip\b|femur|sternum|scapula|humerus|clavicula|costal|knochen|wirbel"),
     ("muscle", r"muscle|muskel|psoas|autochthon|gluteus|quadratus"),
     ("fat", r"\bfat\b|adipose|fett"),
 )  # fmt: skip
