@@ -92,7 +92,8 @@ def test_the_folder_is_a_scene(written):
     held = scene.attachment
     assert held.at_mm is not None and held.radius_mm == 20 and held.stiffness_n_mm == 2.0
     assert {file.name for file in written.iterdir()} == {
-        "check.png", "ct.nrrd", "import.json", "labels.nrrd", "organ.stl", "scene.toml", "support.stl", "tumour.stl",
+        "check.png", "ct.nrrd", "import.json", "labels.nrrd",
+        "organ.stl", "scene.toml", "support.stl", "tumour.stl",
     }  # fmt: skip
     assert [entry.name for entry in written.parent.iterdir()] == ["a b"]
 

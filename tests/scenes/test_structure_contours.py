@@ -384,7 +384,8 @@ class TestGaps:
         middle, length = 28.3 * slice_mm, 21.5 * slice_mm
         one, (note,) = single(tmp_path, grid, spheroid(heights, middle, 22.0, length))
         assert note.startswith("region 1: ")
-        whole, _ = single(tmp_path, grid, spheroid(slice_mm * np.arange(kept[0], kept[-1] + 1), middle, 22.0, length))  # fmt: skip
+        all_heights = slice_mm * np.arange(kept[0], kept[-1] + 1)
+        whole, _ = single(tmp_path, grid, spheroid(all_heights, middle, 22.0, length))
         assert ndimage.label(one.values)[1] == 1
         assert planes_of(one, grid) == list(range(kept[0], kept[-1] + 1))
         # Signed distances are interpolated linearly: the convex sections between become smaller by this at
