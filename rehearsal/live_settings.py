@@ -1,7 +1,9 @@
 """What the user can change while a rehearsal runs: sections of the scene, the probe, those of the window."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from errors import UserError
 from rehearsal.build_solver import step_settings
@@ -10,7 +12,15 @@ from render.keys import default_keys
 from render.viewer import WindowSettings
 from scenes.scene import Gravity, Image, SolverSection
 from scenes.tissue import NeoHookeanTissue, Tissue
-from settings import SettingError, settings_in, with_values
+from settings import Control, Key, Section, SettingError, settings_in, with_values
+from ultrasound.target import Target
+
+
+class PlanSettings(Section):
+    """What the next plan is made for, and the margin of plan and cut."""
+
+    margin_mm: Annotated[float, Control("Margin", "Image", is_whole=True)] = Field(5.0, ge=0, le=20)
+    plan_for: Annotated[Target, Key("Space", "Plan", "target: tumour and margin, tumour, kidney")] = "margin"
 
 
 class LiveSettings(WindowSettings):
@@ -20,6 +30,7 @@ class LiveSettings(WindowSettings):
     solver: SolverSection = SolverSection()
     gravity: Gravity = Gravity()
     image: Image = Image()
+    plan: PlanSettings = PlanSettings()
 
 
 def with_recorded(settings: LiveSettings, values: Mapping[str, Any]) -> LiveSettings:

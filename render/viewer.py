@@ -11,7 +11,6 @@ from pydantic import Field
 
 from settings import Control, Key, Section
 from ultrasound.probe import Probe, ScannerSettings
-from ultrasound.target import Target
 
 Technique = Literal["enucleation", "enucleoresection", "wedge"]
 
@@ -40,13 +39,6 @@ class ViewSettings(Section):
     show_seen: Annotated[bool, Key("N", "View", "coverage: imaged tissue in green")] = False
 
 
-class PlanSettings(Section):
-    """What the next plan is made for, and the margin of plan and cut."""
-
-    margin_mm: Annotated[float, Control("Margin", "Image", is_whole=True)] = Field(5.0, ge=0, le=20)
-    plan_for: Annotated[Target, Key("Space", "Plan", "target: tumour and margin, tumour, kidney")] = "margin"
-
-
 class ResectionSettings(Section):
     """How the next cut is made.
 
@@ -69,7 +61,6 @@ class WindowSettings(Section):
     probe: Probe
     scanner: ScannerSettings = ScannerSettings()
     view: ViewSettings = ViewSettings()
-    plan: PlanSettings = PlanSettings()
     resection: ResectionSettings = ResectionSettings()
 
 

@@ -170,7 +170,7 @@ class CommandOptions(BaseModel):
     ``click.Choice`` it is among.
     """
 
-    model_config = ConfigDict(use_attribute_docstrings=True)
+    model_config = ConfigDict(use_attribute_docstrings=True, extra="forbid")
 
     scene_sections: ClassVar[tuple[str, ...]] = ()
     """Sections of a scene whose settings with an option are options of the command too."""

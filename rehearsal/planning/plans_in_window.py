@@ -9,7 +9,7 @@ from time import perf_counter
 from joblib import cpu_count
 
 from rehearsal.case import Case
-from rehearsal.live_settings import LiveSettings
+from rehearsal.live_settings import LiveSettings, PlanSettings
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.notices import Notices
 from rehearsal.planning.plan_file import Plan, PlanError, next_plan_path, write_plan
@@ -17,7 +17,7 @@ from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plan_search import make_plan, total_work
 from rehearsal.planning.sweep_trial import PlanningProblem, TrialWorkers
 from rehearsal.worker_processes import WorkerError, Workers
-from render.viewer import Controls, PlanSettings
+from render.viewer import Controls
 from scenes.anatomy import LoadedAnatomy
 from ultrasound.target import Target
 

@@ -5,12 +5,13 @@ their figures.
 import numpy as np
 
 from rehearsal.deformed_anatomy import DeformedAnatomy
+from rehearsal.live_settings import LiveSettings
 from rehearsal.resection.cut import Cut, CutSettings, cut_organ
 from rehearsal.resection.operation import LEAST_SEEN, IsSeen, distance_to_tumour, seen_share
 from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.resection_state import Point
 from rehearsal.resection.score_line import LEAST_MARKS, ResectionError, ScoreLine, score_line
-from render.viewer import Score, WindowSettings
+from render.viewer import Score
 from sim.fields import array_of
 from sim.lattice import CellInterpolation
 from sim.skinning import Skin
@@ -26,7 +27,7 @@ UNSEEN = (
 )
 
 
-def cut_settings(settings: WindowSettings) -> CutSettings:
+def cut_settings(settings: LiveSettings) -> CutSettings:
     """How the sliders say that the next cut is made."""
     resection = settings.resection
     filling: Filling = "air" if resection.air_in_crater else "fluid"

@@ -66,7 +66,7 @@ def validate(options: ValidateOptions) -> None:
     The organ is pressed as in the experiment, and its beads compared with the measured ones.
     """
     changes = options.model_dump(
-        exclude={"case", "model", "quality", "check", "arch", "json_file"}, exclude_none=True
+        exclude={"case", "model", "quality", "check", "arch", "json_file", "changes"}, exclude_none=True
     )
     setup = choose_setup(options.model or model_with(changes, USUAL), options.quality, **changes)
     loaded = load_case(options.case)

@@ -42,7 +42,7 @@ pytestmark = pytest.mark.usefixtures("arrays_stored")
 class SlowMachine(Pace):
     """Each step takes longer than the longest one simulates."""
 
-    def watch(self, took_ms: float, length_s: float) -> None:
+    def note(self, took_ms: float, length_s: float) -> None:
         sleep(0.08)
 
 

@@ -179,21 +179,26 @@ def test_the_command_line_refuses_a_size_beside_what_chooses_it(line, words, cap
 
 
 def test_a_quality_sets_size_and_iterations_and_leaves_the_material():
-    scene, firm = load_scene(PAPER), RehearseOptions(young_kpa=33.0)
+    scene, firm = load_scene(PAPER), RehearseOptions(changes={"tissue.young_kpa": 33.0})
     for quality, cell_mm, iterations in (("fast", 5.0, 4), ("accurate", 2.0, 12)):
         asked, _ = as_asked(scene, firm.model_copy(update={"quality": quality}))
         assert (asked.tissue.cell_mm, asked.tissue.young_kpa) == (cell_mm, 33.0)
         assert (asked.solver.substeps, asked.solver.iterations) == (1, iterations)
-    stiff = RehearseOptions(stiffness=0.7, quality="fast")
+    stiff = RehearseOptions(changes={"tissue.stiffness": 0.7}, quality="fast")
     asked, _ = as_asked(scene, stiff)
     assert (asked.tissue.radius_mm, asked.tissue.stiffness, asked.solver.iterations) == (3.3, 0.7, 9)
     stiff.check()
-    RehearseOptions(young_kpa=33.0, budget_ms=5.0, error_mm=0.1).check()
+    RehearseOptions(changes={"tissue.young_kpa": 33.0}, budget_ms=5.0, error_mm=0.1).check()
     assert as_asked(scene, RehearseOptions())[0] == scene
     # For a haptic device the fast preset, unless the user chooses something else.
     quick, _ = as_asked(scene, RehearseOptions(rate=250.0))
     assert quick.tissue.cell_mm == 5.0 and quick.solver.time_step_s == scene.solver.time_step_s
-    for own in (dict(cell=4.0), dict(quality="balanced"), dict(iterations=2), dict(error_mm=0.1)):
+    for own in (
+        dict(changes={"tissue.cell_mm": 4.0}),
+        dict(quality="balanced"),
+        dict(changes={"solver.iterations": 2}),
+        dict(error_mm=0.1),
+    ):
         assert RehearseOptions(rate=250.0, **own).preset == own.get("quality")
 
 
