@@ -16,15 +16,15 @@ from rehearsal.commands.command_line import (
     make_folder,
     start_taichi,
 )
-from rehearsal.planning.plan_file import MOST_SWEEPS
 from rehearsal.result_files import save_figure, write_csv, write_json
-from rehearsal.worker_processes import Workers
-from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
 from scenes.tissue import QUALITIES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from rehearsal.worker_processes import Workers
+    from scenes.anatomy import LoadedAnatomy
 
 DPI = 130
 
@@ -48,18 +48,21 @@ class Study:
     name: str
     out: Path
     backend: str = ""
-    loaded: tuple[Scene, LoadedAnatomy] | None = None
+    loaded: "tuple[Scene, LoadedAnatomy] | None" = None
     jobs: int | None = None
     dask: str | None = None
 
     @property
-    def scene(self) -> tuple[Scene, LoadedAnatomy]:
+    def scene(self) -> "tuple[Scene, LoadedAnatomy]":
         """The SCENE of a study that has this argument, and its anatomy."""
         assert self.loaded is not None
         return self.loaded
 
-    def workers(self) -> Workers:
+    def workers(self) -> "Workers":
         """The processes of --jobs or --dask; a context manager."""
+        # Not of each study.
+        from rehearsal.worker_processes import Workers
+
         return Workers(self.jobs, self.dask)
 
     def progress(self, total: int, unit: str, work: Iterable[Any] | None = None) -> tqdm:
@@ -170,8 +173,3 @@ def number_option(
 def whole_option(name: str, low: int, high: int, default: int, help: str | None = None) -> Option:
     """An option for an integer from low to high."""
     return click.option(name, type=WholeRange(low, high), default=default, show_default=True, help=help)
-
-
-trials_option = whole_option(
-    "--trials", MOST_SWEEPS, 100_000, 24, "Simulated passes of the probe in the search for a plan."
-)

@@ -23,7 +23,8 @@ from scenes.surfaces import volume_mm3
 from scenes.tissue import QUALITIES
 from studies.cohort.cohort_table import CohortFile, PatientRow, read_rows, text_of, write_rows
 from studies.cohort.patient_run import MEASURED, PatientResult, run_patient
-from studies.study import Study, paths_argument, study_command, trials_option
+from studies.planning.plan_comparison import trials_option
+from studies.study import Study, paths_argument, study_command
 from ultrasound.target import Target
 from version import VERSION
 

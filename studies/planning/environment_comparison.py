@@ -10,7 +10,8 @@ from rehearsal.planning.plan_search import make_plan, total_work
 from rehearsal.planning.sweep_trial import TrialWorkers
 from scenes.scene import EMBEDDED
 from studies.planning.baseline_sweeps import planned, random_sweep, straight
-from studies.study import Results, Study, paths_argument, study_command, trials_option
+from studies.planning.plan_comparison import trials_option
+from studies.study import Results, Study, paths_argument, study_command
 from studies.tables_and_panels import table_of
 
 if TYPE_CHECKING:

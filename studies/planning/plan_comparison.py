@@ -14,6 +14,7 @@ import trimesh
 
 from rehearsal.commands.command_line import load_patient
 from rehearsal.configuration import PRESETS, probe_of, scene_of
+from rehearsal.planning.plan_file import MOST_SWEEPS
 from rehearsal.planning.plan_search import make_plan, total_work, try_path, work_at
 from rehearsal.planning.sweep_score import ScoreTerms, score
 from rehearsal.planning.sweep_trial import PlanningProblem, Trial, TrialWorkers
@@ -21,7 +22,7 @@ from rehearsal.worker_processes import Workers
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import EMBEDDED, Scene
 from studies.planning.baseline_sweeps import UNPLANNED, planned, random_sweep
-from studies.study import Results, Study, paths_argument, study_command, trials_option
+from studies.study import Results, Study, paths_argument, study_command, whole_option
 from studies.tables_and_panels import table_of
 from ultrasound.target import Target
 
@@ -34,6 +35,9 @@ TUMOUR_MM, UNDER_MM, ALONG = 10.0, 1.5, 0.35
 PLANNED_ON = PRESETS["neo-hookean"]["balanced"]
 # Another grid and more iterations: a plan that suits only its own model scores badly here.
 JUDGED_ON = PLANNED_ON.but(cell_mm=2.7, iterations=8)
+trials_option = whole_option(
+    "--trials", MOST_SWEEPS, 100_000, 24, "Simulated passes of the probe in the search for a plan."
+)
 COLUMNS = {
     "sweep": "{name}",
     "covered, %": "{seen_percent:.0f}",
