@@ -2,25 +2,33 @@
 
 from collections import Counter
 from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 from settings_at_start import settings_with
 
+from rehearsal.case import case_of
 from rehearsal.commands.plan_command import plan
 from rehearsal.commands.rehearse_command import rehearse
-from rehearsal.live_settings import LiveSettings
+from rehearsal.live_settings import LiveSettings, initial_settings
+from rehearsal.pressed_organ import PressedOrgan
 from render.keys import with_next
 from render.sliders import draw_sliders
 from render.viewer import Geometry
 from render.window_layout import FULL_SIZE, Rect
-from scenes.scene import OPTIONS, SETTINGS
+from scenes.anatomy import LoadedAnatomy
+from scenes.scene import EMBEDDED, OPTIONS, SETTINGS, Gravity, SolverSection, load_scene
+from scenes.tissue import ShapeMatchingTissue
 from settings import SettingError, live_settings, live_values, section_of, settings_in, value_of, with_values
+from sim.solver import StepSettings
 from ultrasound.probe import PROBES, load_probe
 
 GEOMETRY = Geometry(
     (None, np.zeros((0, 3))), np.zeros((2, 3)), tumour=(1, 1), parts={"vessel": 1}, support=(1, 1)
 )
+SMALL = LoadedAnatomy(trimesh.creation.icosphere(subdivisions=2, radius=20.0), None, None, ())
 GROUPS = {setting.control.group for setting in settings_in(LiveSettings) if setting.control is not None}
 ALL_BOXES = {group: Rect(0, 0, 100, 100) for group in (*GROUPS, "Tissue")}
 
@@ -30,6 +38,7 @@ class Hand:
 
     def __init__(self, label: str = "", value: object = None) -> None:
         self.label, self.value, self.drawn = label, value, Counter()
+        self.whole: list[str] = []
 
     def sub_window(self, name, *place):
         return nullcontext()
@@ -40,6 +49,7 @@ class Hand:
 
     def slider_int(self, label, value, low, high):
         assert isinstance(value, int) and low <= value <= high
+        self.whole.append(label)
         return self.checkbox(label, value)
 
     def slider_float(self, label, value, low, high):
@@ -95,7 +105,9 @@ def test_a_moved_control_changes_its_setting_alone(label, moved, path, value):
 def test_a_number_between_the_steps_of_its_slider_stays_until_it_is_moved():
     settings = settings_with({"probe.depth_mm": 62.4, "tissue.young_kpa": 0.35 + 1.0})
     assert drawn(settings, Hand()) is settings
-    assert drawn(settings, Hand("Depth mm", 63)).probe.depth_mm == 63.0
+    hand = Hand("Depth mm", 63)
+    assert drawn(settings, hand).probe.depth_mm == 63.0
+    assert "Depth mm" in hand.whole and "Young kPa" not in hand.whole
 
 
 @pytest.mark.parametrize("probe, geometry", [("curvilinear", "CURVILINEAR"), ("phased", "PHASED")])
@@ -136,6 +148,23 @@ def test_a_value_that_cannot_be_is_refused_in_words(values, words):
     with pytest.raises(SettingError) as error:
         settings_with(values)
     assert words in str(error.value) and "\n" not in str(error.value)
+
+
+def test_at_the_start_what_the_scene_leaves_open_has_the_models_values():
+    settings = initial_settings(case_of(load_scene(EMBEDDED), SMALL))
+    assert (settings.solver.substeps, settings.solver.iterations) == (1, 4)
+    assert {"solver.substeps", "solver.iterations"} <= live_values(settings).keys()
+
+
+def test_what_steps_depend_on_follows_the_settings():
+    organ = PressedOrgan.__new__(PressedOrgan)
+    organ.case, organ.model = SimpleNamespace(gravity_direction=np.array([0.0, 1.0, 0.0])), None
+    organ.settings, organ.young_kpa = StepSettings(), None
+    tissue = ShapeMatchingTissue(model="shape-matching", stiffness=0.4)
+    organ.set(tissue, SolverSection(substeps=2, iterations=7), Gravity(acceleration_m_s2=2.0))
+    step = organ.settings
+    assert (step.stiffness, step.substeps, step.iterations) == (0.4, 2, 7)
+    assert step.gravity == (0.0, 2000.0, 0.0)
 
 
 def test_values_that_were_not_set_stay_defaults():

@@ -80,6 +80,17 @@ def repeated(path: Path, at_s: float = 0.0) -> tuple[Timeline, ReplayCheck]:
     return stepper, check
 
 
+def test_settings_of_tissue_solver_and_gravity_change_the_organ():
+    timeline = fake_timeline()
+    for values in CHANGES:
+        timeline.submit(SetValues(values=values))
+    organ = timeline.organ
+    assert (organ.settings.iterations, organ.young_kpa, organ.gravity) == (2, 20.0, 1.0)
+    timeline.submit(SetValues(values={"solver.iterations": -1}))
+    (refused,) = [event for event in timeline.newest().events if isinstance(event, Refused)]
+    assert "solver.iterations = -1" in refused.reason and organ.settings.iterations == 2
+
+
 class AnySession(RuleBasedStateMachine):
     """Commands in any order, beside a model of what undo and bookmarks restore."""
 
