@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from errors import UserError
+from errors import UserError, meant
 from scenes.scene import OPTIONS, Scene, SolverSection, with_options
 from scenes.tissue import QUALITIES, TISSUES
 from ultrasound.probe import Probe, ProbeError, changed_probe, load_probe
@@ -109,8 +109,12 @@ def scene_of(scene: Scene, setup: Setup) -> Scene:
 
 
 def with_quality(scene: Scene, quality: str | None) -> Scene:
-    """A scene with the resolution and step of its model's preset, if one is chosen."""
-    return scene if quality is None else scene_of(scene, PRESETS[scene.tissue.model][quality])
+    """A scene with the resolution and step of its model's preset, if one is chosen. Raises SetupError."""
+    if quality is None:
+        return scene
+    if quality not in QUALITIES:
+        raise SetupError(f"quality = {quality!r}: there is no such preset; {meant(quality, QUALITIES)}")
+    return scene_of(scene, PRESETS[scene.tissue.model][quality])
 
 
 def choose_setup(model: str, quality: str, **changes: Any) -> Setup:

@@ -9,23 +9,24 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
-from errors import UserError
+from errors import UserError, explained
 from rehearsal.case import Case, case_of
 from rehearsal.configuration import with_quality
 from rehearsal.deformed_anatomy import DeformedAnatomy, scanned_ct
 from rehearsal.loop.command import Command, Load, Move, NewSession
-from rehearsal.loop.frame import Frame
+from rehearsal.loop.frame import Frame, Refused
 from rehearsal.loop.protocols import Stepper
 from rehearsal.loop.timeline import Timeline
 from rehearsal.pressed_organ import PressedOrgan
 from scenes.anatomy import LoadedAnatomy, load_anatomy
-from scenes.scene import EMBEDDED, load_scene, scene_file, with_options
+from scenes.scene import EMBEDDED, Scene, load_scene, scene_file, with_options
 from scenes.terminal import ReportProgress, no_progress
 from sim.device import start
-from ultrasound.probe import DetailLevel, Mode
+from ultrasound.probe import DETAIL_LEVELS, DetailLevel, Mode
 from ultrasound.probe_manipulator import ProbeManipulator, advanced
-from ultrasound.scanner import Scanner
+from ultrasound.scanner import IMAGES_OF_MODE, Scanner
 
 
 class Rehearsal:
@@ -62,17 +63,30 @@ class Rehearsal:
         """The frame that was shown last."""
         return self.anatomy.frame
 
+    @property
+    def scene(self) -> Scene:
+        """The scene with the settings of tissue, solver and gravity that are in force."""
+        return self.timeline.scene
+
     def do(self, *commands: Command) -> Frame:
-        """Apply commands, and show the frame after them."""
+        """Apply commands, and show the frame after them. Raises UserError where one was refused."""
         for command in commands:
+            if not isinstance(command, Command):
+                raise UserError(f"{command!r} is no command; expected one such as Undo() or Move(pose=...)")
             self.timeline.submit(command)
         frame = self.timeline.newest()
         self.anatomy.show(frame)
+        for event in frame.events:
+            if isinstance(event, Refused) and any(event.command is command for command in commands):
+                raise UserError(f"{event.command.kind}: {event.reason}")
         return frame
 
     def move(self, pose: np.ndarray) -> Frame:
-        """Make a step to a pose (4, 4) of the transducer, and show the frame after it."""
-        return self.do(Move(pose=pose))
+        """Make a step to a pose (4, 4) of the transducer, and show the frame after it. Raises UserError."""
+        try:
+            return self.do(Move(pose=pose))
+        except ValidationError as error:
+            raise UserError(explained(error)) from None
 
     def images(
         self,
@@ -82,16 +96,21 @@ class Rehearsal:
     ) -> dict[str, np.ndarray]:
         """What the probe sees now: images uint8 of a shape (rows, columns), the scene's by default, by name.
 
-        Raises UserError without a CT.
+        Raises UserError without a CT, and for a mode, level or shape that there is not.
         """
         image = self.case.scene.image
+        if mode not in IMAGES_OF_MODE or detail_level not in DETAIL_LEVELS or min(shape or (1,)) < 1:
+            raise UserError(
+                f"mode = {mode!r}, detail_level = {detail_level!r}, shape = {shape}: expected one of "
+                f"{', '.join(IMAGES_OF_MODE)}; one of {', '.join(DETAIL_LEVELS)}; at least one row and column"
+            )
         shown = self.anatomy.image_plane(), self.case.probe, mode, detail_level
         return self._scanner.images(*shown, image.window_hu, image.level_hu, shape).by_name
 
     def labels(self) -> np.ndarray:
         """Ground truth of the last images (rows, columns) uint8: see ``ultrasound.ground_truth_labels``.
 
-        Raises UserError without a CT.
+        Those of another pose need ``images`` first. Raises UserError without a CT.
         """
         return self._scanner.ground_truth.render()
 

@@ -7,7 +7,7 @@ centre of the array face.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from pydantic import ConfigDict, Field, ValidationError, model_validator
@@ -25,6 +25,7 @@ Mode = Literal["both", "b-mode", "ct"]
 # Realism of the B-mode image: reflection and attenuation; also speckle and point spread; also the slice
 # thickness.
 DetailLevel = Literal["reflection", "speckle", "elevation"]
+DETAIL_LEVELS: tuple[DetailLevel, ...] = get_args(DetailLevel)
 
 DopplerMode = Literal["off", "colour", "power"]
 

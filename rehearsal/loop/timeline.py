@@ -81,8 +81,8 @@ class Timeline:
         self._digested = SETTLED
         self._events: list[Event] = []
         self._noted_iterations = organ.settings.iterations
-        # With the settings of tissue, solver and gravity that were made since the start.
-        self._scene = organ.case.scene
+        # With the settings of tissue, solver and gravity that are in force.
+        self.scene = organ.case.scene
 
     def submit(self, command: Command) -> None:
         """Apply a command at once. ``Follow`` is a step of the length that is set."""
@@ -203,8 +203,8 @@ class Timeline:
     def _set(self, values: dict[str, Value]) -> None:
         """Set what steps depend on; other settings are only recorded. Raises SettingError."""
         of_step = {path: value for path, value in values.items() if path.split(".")[0] in STEPPED}
-        self._scene = with_values(self._scene, of_step)
-        self.organ.set(self._scene.tissue, self._scene.solver, self._scene.gravity)
+        self.scene = with_values(self.scene, of_step)
+        self.organ.set(self.scene.tissue, self.scene.solver, self.scene.gravity)
         self._noted_iterations = self.organ.settings.iterations
 
     def _begin(self, manipulator: ManipulatorState | None = None) -> None:

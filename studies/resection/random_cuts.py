@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
+from errors import UserError
 from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.loop.command import Mark
 from rehearsal.rehearsal import Rehearsal
@@ -206,10 +207,12 @@ def _result(patient: str, seed: int, rehearsal: Rehearsal, score: RandomScore) -
     organ, anatomy = rehearsal.organ, rehearsal.anatomy
     restorations = organ.divergence_check.restorations
     cut_out = cut_command(anatomy, score.settings, lambda points: score.seen)
-    frame = rehearsal.do(Mark(places_mm=score.marks.tolist()), cut_out)
-    if anatomy.cut is None:
-        return RandomResult(patient, seed, score.kind, refused=frame.notices[0])
+    try:
+        rehearsal.do(Mark(places_mm=score.marks.tolist()), cut_out)
+    except UserError as error:
+        return RandomResult(patient, seed, score.kind, refused=str(error).partition(": ")[2])
     cut = anatomy.cut
+    assert cut is not None
     faults = surface_faults(cut, rehearsal.case.organ)
     for _ in range(STEPS):
         rehearsal.advance(organ.pose)

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from errors import UserError
 from rehearsal.gymnasium_environment import MOST_DEG, MOST_MM, ProbeEnvironment
-from rehearsal.rehearsal import open_rehearsal
+from rehearsal.loop.command import SetValues, Undo
+from rehearsal.rehearsal import Rehearsal, open_rehearsal
 from studies.planning.baseline_sweeps import random_sweep, straight
 from studies.planning.environment_comparison import followed
 from ultrasound.probe_manipulator import array_face_centre
@@ -27,10 +28,16 @@ def test_the_code_of_the_page_runs(capsys):
     for block in blocks:
         exec(block, names)  # the page's own code
     printed = capsys.readouterr().out
-    assert len(blocks) == 3 and re.search(r"^0\.\d\d N; tumour in \d+ % of the image$", printed, re.MULTILINE)
+    assert len(blocks) == 4 and re.search(r"^0\.\d\d N; tumour in \d+ % of the image$", printed, re.MULTILINE)
     assert 0.5 < float(re.search(r"has moved by (\S+) mm", printed)[1]) < 6.0
+    assert "now 30.0 kPa" in printed and "the first pixel is at [" in printed
     observation = names["observation"]
     assert observation["image"].shape == (64, 64) and observation["image"].any()
+
+
+@pytest.fixture(scope="module")
+def held(tmp_path_factory) -> Rehearsal:
+    return open_rehearsal(folder_of_ball(tmp_path_factory.mktemp("ball")), changes={"press.warm_up_steps": 2})
 
 
 def test_without_a_ct_there_are_no_images(tmp_path):
@@ -39,6 +46,32 @@ def test_without_a_ct_there_are_no_images(tmp_path):
     assert frame.number == 1 and frame.wrench is not None and np.isfinite(frame.positions).all()
     with pytest.raises(UserError, match="no CT"):
         rehearsal.images()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (lambda it: it.do(SetValues(values={"tissue.young_kpa": -3.0})), "set: tissue.young_kpa = -3.0"),
+        (lambda it: it.do(SetValues(values={"tissue.yong_kpa": 3.0})), "there is no such setting"),
+        (lambda it: it.do(Undo()), "undo: Nothing to undo"),
+        (lambda it: it.do("undo"), "'undo' is no command"),
+        (lambda it: it.do(Undo), "is no command"),
+        (lambda it: it.move([1, 2, 3]), "pose"),
+        (lambda it: it.images("MR"), "mode = 'MR'"),
+        (lambda it: it.images(shape=(0, 5)), "at least one row"),
+        (lambda it: open_rehearsal(quality="quick"), "quality = 'quick'"),
+        (lambda it: open_rehearsal(changes={"tissue.yong_kpa": 3.0}), "did you mean young_kpa"),
+    ],
+)
+def test_mistakes_of_a_program_are_errors_in_words(held, wrong, words):
+    with pytest.raises(UserError) as error:
+        wrong(held)
+    assert words in str(error.value) and "\n" not in str(error.value)
+
+
+def test_settings_in_force_can_be_read(held):
+    held.do(SetValues(values={"tissue.young_kpa": 30.0}))
+    assert held.scene.tissue.young_kpa == 30.0 and held.case.scene.tissue.young_kpa == 15.0
 
 
 def episode(environment: ProbeEnvironment, actions: np.ndarray, seed: int = 1) -> tuple[float, list[bytes]]:

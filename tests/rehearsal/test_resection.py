@@ -20,7 +20,8 @@ from rehearsal.commands.command_line import CommandError
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.drawn_geometry import drawn_geometry
 from rehearsal.input_files import read_files
-from rehearsal.loop.command import BeginAction, Bookmark, Checkpoint, Load, Mark, Move, Redo, Undo
+from rehearsal.loop.command import BeginAction, Bookmark, Checkpoint, Command, Load, Mark, Move, Redo, Undo
+from rehearsal.loop.frame import Frame
 from rehearsal.loop.timeline import Timeline
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.notices import Notices
@@ -95,9 +96,16 @@ def scored(rehearsal: Rehearsal, marks: np.ndarray) -> None:
     assert not rehearsal.do(Mark(places_mm=marks.tolist())).notices
 
 
+def applied(rehearsal: Rehearsal, *commands: Command) -> Frame:
+    """The frame after commands, of which some may be refused."""
+    for command in commands:
+        rehearsal.timeline.submit(command)
+    return rehearsal.do()
+
+
 def cut(rehearsal: Rehearsal, settings: CutSettings = CUT, is_seen=None) -> list[str]:
     """Cut along the score; return the notices."""
-    return rehearsal.do(cut_command(rehearsal.anatomy, settings, is_seen)).notices
+    return applied(rehearsal, cut_command(rehearsal.anatomy, settings, is_seen)).notices
 
 
 def resected(rehearsal: Rehearsal, marks: np.ndarray, settings: CutSettings = CUT) -> None:
@@ -411,7 +419,7 @@ def source_of(
 def acted(rehearsal: Rehearsal, source: UserSource, **controls) -> list[str]:
     """The frame after a user's controls; return the notices."""
     given = Controls(settings_with(), **controls)
-    frame = rehearsal.do(*source.commands(rehearsal.frame, given, 1 / 60))
+    frame = applied(rehearsal, *source.commands(rehearsal.frame, given, 1 / 60))
     return [*frame.notices, *source.notices.present()]
 
 

@@ -176,7 +176,7 @@ def test_the_command_reports_writes_and_is_read_again(tmp_path, monkeypatch, cap
         def __exit__(self, *_):
             return None
 
-    monkeypatch.setattr("studies.study.Workers", lambda jobs, dask: Here())
+    monkeypatch.setattr("rehearsal.worker_processes.Workers", lambda jobs, dask: Here())
     out = tmp_path / "out"
     assert app.main(["study", "uncertainty", "--samples", "8", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
