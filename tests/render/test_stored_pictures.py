@@ -1,4 +1,4 @@
-"""Pictures of one scene against those that are stored in tests/pictures: what no closed form tells may not
+"""Pictures of one scene against those that are stored in tests/pictures: what no closed form shows may not
 change unseen.
 
 Where a change of the pictures is meant, ``pytest tests/render/test_stored_pictures.py --renew-pictures``

@@ -211,7 +211,7 @@ def test_what_was_not_imaged_is_the_gap(organ, first, last):
         off = VOXEL_MM / 2 * np.pi * (R**2 - edge**2) / 1000
         assert gap.volume_ml == pytest.approx(volume, abs=off + 0.012 * volume)
         # The largest ball in a cap has its height across; of layers, a voxel more or less, the even number at
-        # or above is told.
+        # or above is reported.
         height = R - sides[edge] * edge
         assert height - VOXEL_MM <= gap.thickness_mm <= height + 2 * VOXEL_MM
     missing = sum(caps) / (4 / 3 * np.pi * R**3 / 1000)
