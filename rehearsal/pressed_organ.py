@@ -28,6 +28,7 @@ from sim.device import backend
 from sim.divergence_check import DivergenceCheck, DivergenceState
 from sim.material import Material, Part
 from sim.neo_hookean import NeoHookean
+from sim.proxy import Proxy
 from sim.removed_tissue import RemovedTissue
 from sim.shapes import Plane, SignedDistanceField
 from sim.solver import SolverState
@@ -37,6 +38,13 @@ from sim.viscoelasticity import Relaxation
 from ultrasound.probe_manipulator import advanced, array_face_centre, poses_between
 
 AWAY_MM = 200.0
+# How deep the probe may move into the tissue in a step, before the tissue yields.
+MOST_PENETRATION_MM = 0.5
+# Force of a probe that only touches.
+TOUCH_N = 0.1
+# Stiffness of the virtual coupling of hand and probe: the nearer the force is to its limit, the less the probe
+# may move on in a step.
+COUPLING_N_MM = 5.0
 
 
 @dataclass(frozen=True)
@@ -67,7 +75,7 @@ class PressedOrgan:
         self.divergence_check = DivergenceCheck(self.solver)
         self.notice = ""
         self.steps = 0
-        self.pose = advanced(case.press_pose, -AWAY_MM)
+        self.pose = self.hand = advanced(case.press_pose, -AWAY_MM)
 
     def _build_solver(self, serial: bool | None) -> None:
         case = self.case
@@ -89,6 +97,7 @@ class PressedOrgan:
             parts=self.parts_of_tissue,
         )
         self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
+        self.proxy = Proxy(self.contacts, self.tool)
         self.settings = step_settings(tissue, section)
         self.young_kpa: float | None = getattr(tissue, "young_kpa", None)
         self._set_gravity(case.scene.gravity)
@@ -192,28 +201,41 @@ class PressedOrgan:
         finally:
             self.settings.time_step_s, self.settings.iterations = usual
 
-    def advance(self, pose: np.ndarray) -> None:
-        """Advance one time step, at whose end the transducer has a pose (4, 4).
+    def advance(self, hand: np.ndarray, presses: bool = True) -> None:
+        """Advance one time step, in which the transducer follows a hand at a pose (4, 4) as far as the tissue
+        lets it; unless it ``presses``, it only touches.
 
         ``notice`` is the message of the divergence check if it restored the state, else empty.
         """
+        pose = self._proxy_of(hand, presses)
         self.solver.step(self.settings, poses_between(self.pose, pose, self.settings.substeps))
         self.notice = self.divergence_check.check(self.settings.time_step_s)
-        self.pose = pose
+        self.pose, self.hand = pose, hand
         self.steps += 1
 
+    def _proxy_of(self, hand: np.ndarray, presses: bool) -> np.ndarray:
+        """The transducer's next pose (4, 4), within the limits of force and penetration."""
+        limit_n = self.case.scene.transducer.force_limit_n if presses else TOUCH_N
+        wrench = self.wrench()
+        goal = hand if wrench is None else within_force(self.pose, hand, wrench[:3], limit_n)
+        return self.proxy.pose_towards(self.pose, goal, MOST_PENETRATION_MM if presses else 0.0)
+
     def timed_step(
-        self, pose: np.ndarray, length_s: float | None = None, iterations: int | None = None
+        self,
+        hand: np.ndarray,
+        length_s: float | None = None,
+        iterations: int | None = None,
+        presses: bool = True,
     ) -> tuple[float, np.ndarray | None]:
-        """Advance by a step of a length [s] with so many iterations, where given; return the time that it
+        """As ``advance``, by a step of a length [s] with so many iterations, where given; return the time that it
         took [ms], and the wrench.
         """
         took_ms: list[float] = []
         with self.step_of(length_s or self.settings.time_step_s, iterations or self.settings.iterations):
-            timed(partial(self.advance, pose), took_ms)
+            timed(partial(self.advance, hand, presses), took_ms)
         wrench = self.wrench()
         if self.on_wrench is not None and wrench is not None:
-            self.on_wrench(pose, wrench)
+            self.on_wrench(self.pose, wrench)
         return took_ms[0], wrench
 
     def wrench(self) -> np.ndarray | None:
@@ -233,7 +255,8 @@ class PressedOrgan:
         """Restore a state; the steps that follow give the same bits as before."""
         self.solver.restore(state.solver)
         self.divergence_check.state = state.divergence
-        self.pose, self.steps = state.pose, state.steps
+        self.pose = self.hand = state.pose
+        self.steps = state.steps
 
     def store_valid_state(self) -> None:
         """Make the present tissue, if it is valid, the state that the divergence check restores."""
@@ -267,6 +290,23 @@ class PressedOrgan:
         """A hash of the tissue's state: it changes with every bit."""
         state = self.body.snapshot()
         return hashlib.sha256(state.position.tobytes() + state.velocity.tobytes()).hexdigest()[:16]
+
+
+def within_force(pose: np.ndarray, goal: np.ndarray, force_n: np.ndarray, limit_n: float) -> np.ndarray:
+    """A goal (4, 4) of the transducer at a pose (4, 4) [mm], moved so that the force (3,) [N] of the tissue on it
+    stays within a limit.
+    """
+    size_n = float(np.linalg.norm(force_n))
+    if size_n < 1e-9:
+        return goal
+    outward = force_n / size_n
+    most_mm = (limit_n - size_n) / COUPLING_N_MM
+    beyond_mm = outward @ (pose[:3, 3] - goal[:3, 3]) - max(most_mm, -MOST_PENETRATION_MM)
+    if beyond_mm <= 0.0:
+        return goal
+    moved = goal.copy()
+    moved[:3, 3] += beyond_mm * outward
+    return moved
 
 
 def attachments_of(

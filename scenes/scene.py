@@ -163,7 +163,8 @@ class Transducer(Section):
     ``speed_mm_s`` at most.
 
     Its shape is a cuboid, lateral x elevation x length: the probe's housing, or ``size_mm``. The window warns
-    where the tissue under it is compressed by more than ``compression_warning_mm``.
+    where the tissue under it is compressed by more than ``compression_warning_mm``. It presses with at most
+    ``force_limit_n``: where the hand asks for more, the probe stays behind it.
     """
 
     probe: Annotated[str, "--probe"] = "linear"
@@ -171,6 +172,7 @@ class Transducer(Section):
     size_mm: Annotated[tuple[ProbeLength, ProbeLength, ProbeLength], LIST] | None = None
     speed_mm_s: float = Field(150.0, gt=0, le=2000)
     compression_warning_mm: float = Field(8.0, gt=0, le=100)
+    force_limit_n: float = Field(10.0, gt=0, le=100)
 
 
 class Trocar(Section):

@@ -47,6 +47,7 @@ class ShapeContacts:
         self.plane = zeros(body.count, len(shapes), 4, within=1)
         if self.has_friction:
             self.push = zeros(body.count, len(shapes), 4, within=1)
+        self.count = body.count
         self.touched = zeros(body.count, kind=ti.i32)
         self.last_query = zeros(body.count, len(shapes), 4, within=1)
         self.reset()
@@ -64,6 +65,11 @@ class ShapeContacts:
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Restore a snapshot; the steps that follow give the same bits."""
         fill((self.plane, state["plane"]), (self.last_query, state["found"]))
+
+    @ti.func
+    def surface_ball(self, i):
+        """Particle i, and its radius [mm]."""
+        return tm.vec4(self.body.position[i], self.body.contact_radius[i])
 
     @ti.func
     def is_clear(self, s: ti.template(), i, p, distance):

@@ -222,7 +222,12 @@ class ConvexTool:
     def surface(self, p):
         pose = self.pose[None]
         rotation = pose[:3, :3]
-        local = rotation.transpose() @ (p - pose[:3, 3])
+        surface = self.surface_from(rotation.transpose() @ (p - pose[:3, 3]))
+        return tm.vec4(rotation @ surface.xyz, surface.w)
+
+    @ti.func
+    def surface_from(self, local):
+        """``surface`` in the tool's own frame."""
         depth, normal = -FAR, tm.vec3(0.0)
         nearest = local
         for k in range(self.count):
@@ -237,7 +242,45 @@ class ConvexTool:
         distance = outward.norm()
         if distance > 1e-4:
             depth, normal = distance, outward / distance
-        return tm.vec4(rotation @ normal, depth - self.edge_radius)
+        return tm.vec4(normal, depth - self.edge_radius)
+
+    @ti.func
+    def entered(self, start, p, least_mm: float):
+        """The half-space by which a point that has moved from a start to p has entered the tool, while that
+        moved too: outward normal, and offset of normal . x = offset [mm]; zero where it was not deeper in it
+        than ``least_mm``.
+        """
+        pose = self.pose[None]
+        rotation = pose[:3, :3]
+        local = rotation.transpose() @ (p - pose[:3, 3])
+        path = local - rotation.transpose() @ (start + self.motion(p) - pose[:3, 3])
+        enters, leaves, side = -FAR, 1.0, tm.vec4(0.0)
+        for k in range(self.count):
+            plane = self.half_space[k]
+            after = plane.xyz.dot(local) - plane.w - self.edge_radius
+            before = after - plane.xyz.dot(path)
+            if before > 0.0 and after > 0.0:
+                leaves = -FAR
+            elif before > 0.0:
+                share = before / (before - after)
+                if share > enters:
+                    normal = rotation @ plane.xyz
+                    enters, side = share, tm.vec4(normal, normal.dot(p) - after)
+            elif after > 0.0:
+                leaves = ti.min(leaves, before / (before - after))
+        result = tm.vec4(0.0)
+        if 0.0 <= enters <= leaves:
+            half_way = self.surface_from(local - (1.0 - 0.5 * (enters + leaves)) * path).w
+            if ti.min(half_way, self.surface_from(local).w) < -least_mm:
+                result = side
+        return result
+
+    @ti.func
+    def carried(self, plane):
+        """A plane, normal and offset [mm], moved with the tool in this substep."""
+        back = self.step_back[None]
+        turned = back[:3, :3].transpose() @ plane.xyz + plane.xyz
+        return tm.vec4(turned, plane.w - plane.xyz.dot(back[:3, 3]))
 
 
 def check_count(shapes: list) -> None:

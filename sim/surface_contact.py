@@ -28,6 +28,9 @@ TANGENTIAL_RATIO = 0.5
 REUSE_MM = 0.15
 # Points nearer than this to a shape may touch it within the step.
 NEAR_MM = 3.0
+# A point deeper in a tool than this, or that passes one on a longer path, leaves it by the side that it came by:
+# the nearest side may be another one.
+DEEP_MM = 0.5
 # Forces are summed in blocks of this many points, in an order that does not depend on threads.
 BLOCK = 64
 # Distance around a static shape within which the distance to it must be known [mm].
@@ -121,6 +124,11 @@ class SurfaceContacts:
         fill(*((self.state[name], values) for name, values in state.items()))
 
     @ti.func
+    def surface_ball(self, q):
+        """Point q of the surface, and its radius [mm]."""
+        return tm.vec4(self.point[q], 0.0)
+
+    @ti.func
     def interpolated(self, field: ti.template(), q):
         """Position of point q for the nodes' positions in a field."""
         x = tm.vec3(0.0)
@@ -136,15 +144,57 @@ class SurfaceContacts:
             self.point[q], self.start[q] = p, start
             near = 0
             for s in ti.static(range(len(self.shapes))):
-                query = self.last_query[s, q]
-                if ti.static(self.shapes[s].moves) or not is_known(query, p):
-                    surface = self.shapes[s].surface(p)
-                    query = tm.vec4(p, ti.min(surface.w, REACH_MM))
-                    self.last_query[s, q] = query
-                    self.plane[s, q] = tm.vec4(surface.xyz, surface.xyz.dot(p) - surface.w)
-                if query.w - (p - query.xyz).norm() < NEAR_MM:
-                    near |= 1 << s
+                if ti.static(self.shapes[s].moves):
+                    near |= self.find_tool(s, q, p, start)
+                else:
+                    query = self.last_query[s, q]
+                    if not is_known(query, p):
+                        query = self.nearest(s, q, p)
+                    if query.w - (p - query.xyz).norm() < NEAR_MM:
+                        near |= 1 << s
             self.near[q] = near
+
+    @ti.func
+    def nearest(self, s: ti.template(), q, p):
+        """Find the contact plane of shape s that is nearest to point q at p; return place and distance [mm]."""
+        surface = self.shapes[s].surface(p)
+        query = tm.vec4(p, ti.min(surface.w, REACH_MM))
+        self.last_query[s, q] = query
+        self.plane[s, q] = tm.vec4(surface.xyz, surface.xyz.dot(p) - surface.w)
+        return query
+
+    @ti.func
+    def find_tool(self, s: ti.template(), q, p, start):
+        """Find the contact plane of a tool s, of point q on its path from a start to p; return the tool's bit
+        where it is near.
+        """
+        path = (p - start - self.shapes[s].motion(p)).norm()
+        bit = 0
+        if not self.shapes[s].is_beyond(p, NEAR_MM + path):
+            before, was_near = self.plane[s, q], (self.near[q] >> s) & 1
+            query = self.nearest(s, q, p)
+            if query.w < NEAR_MM:
+                bit = 1 << s
+            if query.w < -DEEP_MM or query.w > 0.0:
+                plane = tm.vec4(0.0)
+                if path > DEEP_MM or query.w < -DEEP_MM:
+                    plane = self.shapes[s].entered(start, p, DEEP_MM)
+                if was_near and plane.xyz.norm_sqr() == 0.0:
+                    plane = self.still_passed(s, self.shapes[s].carried(before), p)
+                if plane.xyz.norm_sqr() > 0.0:
+                    self.plane[s, q] = plane
+                    bit = 1 << s
+        return bit
+
+    @ti.func
+    def still_passed(self, s: ti.template(), plane, p):
+        """The contact plane of a point at p that was deep in tool s or behind it before, if it still is; else
+        zero.
+        """
+        result, depth = tm.vec4(0.0), plane.w - plane.xyz.dot(p)
+        if depth > DEEP_MM and ti.abs(self.shapes[s].surface(p + depth * plane.xyz).w) < DEEP_MM:
+            result = plane
+        return result
 
     @ti.func
     def free_fraction(self, start, end):

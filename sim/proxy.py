@@ -1,0 +1,147 @@
+"""The proxy of a tool (god object: Zilles and Salisbury 1995, with six degrees of freedom Ortega et al. 2007):
+the pose that the tissue lets a tool have, where a hand wants it elsewhere.
+
+The tool moves towards its goal in small increments, and is moved out of the tissue after each: no point of the
+surface is ever deep in the tool, nor passed by it.
+"""
+
+from typing import Any
+
+import numpy as np
+import taichi as ti
+import taichi.math as tm
+from scipy.spatial.transform import Rotation
+
+from sim.fields import array_of, fill, zeros
+from sim.kernels import kernel
+from sim.shapes import FAR, ConvexTool
+
+# No point of a tool moves further than this between two tests of contact: less than half of the thinnest tool.
+INCREMENT_MM = 1.0
+MOST_INCREMENTS = 1000
+# In contact it moves no further than this at a time: its path is bent, and the solver takes it to be straight.
+MOST_CONTACT_PATH_MM = 10.0
+# The points deepest in the tool are moved out one after the other, at most so many in an increment.
+PROJECTIONS = 8
+# What may be left of a penetration after that, and how much further than needed the tool retreats.
+TOLERANCE_MM, ROUNDING_MM = 0.005, 1e-3
+# A tool whose face meets the tissue retreats along its axis, as it is held; where the surface's normal is
+# further from the axis than 60 degrees, along the normal.
+LEAST_ALONG_AXIS = 0.5
+
+
+class Proxy:
+    """The proxy of a tool that may touch the points of ``contacts``."""
+
+    def __init__(self, contacts: Any, tool: ConvexTool) -> None:
+        self.contacts, self.tool = contacts, tool
+        self.start = zeros(4, 4, within=2)
+        # Fraction of the path, and retreat from it.
+        self.reached = zeros(4, within=1)
+        self.near = zeros(contacts.count, kind=ti.i32)
+
+    def pose_towards(self, pose: np.ndarray, goal: np.ndarray, most_mm: float) -> np.ndarray:
+        """The pose (4, 4) of the tool that follows a goal (4, 4) from a pose (4, 4), world from tool [mm].
+
+        It is the goal itself where no point of the tissue is deeper than ``most_mm`` in the tool on its path;
+        else the tool slides along the tissue, or stays before it.
+        """
+        shift = goal[:3, 3] - pose[:3, 3]
+        turn = np.zeros(3)
+        if not np.array_equal(goal[:3, :3], pose[:3, :3]):
+            turn = Rotation.from_matrix(goal[:3, :3] @ pose[:3, :3].T).as_rotvec()
+        fill((self.start, pose))
+        self.find(*shift.tolist(), *turn.tolist(), most_mm)
+        share, *retreat = array_of(self.reached).tolist()
+        if share == 1.0 and not any(retreat):
+            return goal
+        reached = pose.copy()
+        reached[:3, :3] = Rotation.from_rotvec(share * turn).as_matrix() @ pose[:3, :3]
+        reached[:3, 3] += share * shift + retreat
+        return reached
+
+    @kernel
+    def find(self, x: float, y: float, z: float, turn_x: float, turn_y: float, turn_z: float, most_mm: float):
+        """How far the tool gets along a shift [mm] and a rotation vector [rad], and its retreat [mm]."""
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            shift, turn = tm.vec3(x, y, z), tm.vec3(turn_x, turn_y, turn_z)
+            length = ti.max(shift.norm() + turn.norm() * self.tool.ball_mm, 1e-6)
+            count = self.gather_near(length)
+            reached, share, retreat, clearance = tm.vec4(0.0), 0.0, tm.vec3(0.0), 0.0
+            for increment in range(MOST_INCREMENTS):
+                is_free = retreat.norm_sqr() == 0.0 or share * length < MOST_CONTACT_PATH_MM
+                if share < 1.0 and clearance >= 0.0 and is_free:
+                    share = ti.min(1.0, share + (INCREMENT_MM + clearance) / length)
+                    back = self.retreat(self.moved(share, shift, turn), retreat, count, most_mm)
+                    retreat, clearance = back.xyz, back.w
+                    if clearance >= 0.0:
+                        reached = tm.vec4(share, retreat)
+            self.reached[None] = reached
+
+    @ti.func
+    def gather_near(self, length):
+        """The points that the tool may touch on a path of a length [mm]: their number."""
+        middle, count = self.start[None][:3, 3], 0
+        for q in range(self.contacts.count):
+            point = self.contacts.surface_ball(q)
+            reach = self.tool.ball_mm + length + point.w
+            if (point.xyz - middle).norm_sqr() < reach * reach:
+                self.near[count] = q
+                count += 1
+        return count
+
+    @ti.func
+    def moved(self, share, shift, turn):
+        """The pose at a fraction of the path."""
+        pose = self.start[None]
+        rotation = rotation_by(share * turn) @ pose[:3, :3]
+        place = pose[:3, 3] + share * shift
+        for i in ti.static(range(3)):
+            pose[i, 3] = place[i]
+            for k in ti.static(range(3)):
+                pose[i, k] = rotation[i, k]
+        return pose
+
+    @ti.func
+    def retreat(self, pose, retreat, count, most_mm: float):
+        """The retreat [mm] from a pose after which no point is deeper in the tool than ``most_mm``, and how
+        far the tool may then move before it meets one; that is negative where there is no such retreat.
+        """
+        clearance = -FAR
+        for projection in range(PROJECTIONS + 1):
+            if clearance < 0.0:
+                deepest = self.deepest(pose, retreat, count)
+                clearance = deepest.w + most_mm
+                if clearance < 0.0 and projection < PROJECTIONS:
+                    normal, axis, by = deepest.xyz, pose[:3, 2], ROUNDING_MM - clearance
+                    along = -normal.dot(axis)
+                    retreat += by / along * axis if along > LEAST_ALONG_AXIS else -by * normal
+        return tm.vec4(retreat, 0.0 if -TOLERANCE_MM < clearance < 0.0 else clearance)
+
+    @ti.func
+    def deepest(self, pose, retreat, count):
+        """Outward normal of the tool and signed distance [mm] from it, at the point that is deepest in it."""
+        rotation, middle = pose[:3, :3], pose[:3, 3] + retreat
+        deepest = tm.vec4(0.0, 0.0, 0.0, FAR)
+        for k in range(count):
+            point = self.contacts.surface_ball(self.near[k])
+            offset = point.xyz - middle
+            bound = offset.norm() - self.tool.ball_mm - point.w
+            if bound < deepest.w:
+                if bound > INCREMENT_MM:
+                    deepest.w = bound
+                else:
+                    surface = self.tool.surface_from(rotation.transpose() @ offset)
+                    if surface.w - point.w < deepest.w:
+                        deepest = tm.vec4(rotation @ surface.xyz, surface.w - point.w)
+        return deepest
+
+
+@ti.func
+def rotation_by(turn):
+    """The matrix (3, 3) of a rotation vector [rad] (Rodrigues)."""
+    angle = turn.norm()
+    axis = turn / ti.max(angle, 1e-12)
+    across = tm.mat3(0.0, -axis.z, axis.y, axis.z, 0.0, -axis.x, -axis.y, axis.x, 0.0)
+    return tm.eye(3) + ti.sin(angle) * across + (1.0 - ti.cos(angle)) * across @ across
