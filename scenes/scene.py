@@ -166,7 +166,7 @@ class Transducer(Section):
     where the tissue under it is compressed by more than ``compression_warning_mm``.
     """
 
-    probe: Annotated[str, "--probe"] = "linear"
+    probe: Annotated[str, "--probe"] = "drop-in"
     """Probe, by its name or as a file."""
     size_mm: Annotated[tuple[ProbeLength, ProbeLength, ProbeLength], LIST] | None = None
     speed_mm_s: float = Field(150.0, gt=0, le=2000)
@@ -224,7 +224,7 @@ class Image(Section):
     outside: Literal["background", "gel", "air", "fluid"] = "background"
     contact: Literal["organ", "tissue"] = "organ"
     contact_gap_mm: float = Field(1.5, ge=0, le=20)
-    fluid_gap_mm: float = Field(4.0, ge=0, le=5)
+    fluid_gap_mm: float = Field(8.0, ge=0, le=20)
     atlas: Annotated[bool, "--atlas/--no-atlas"] = True
     """Draw from an atlas what the CT cannot show: pyramids without enhancement, the renal fascia, layers in
     muscle.
