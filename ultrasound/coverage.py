@@ -18,8 +18,8 @@ from sim.stored_arrays import stored
 from ultrasound.probe import Probe
 
 VOXEL_MM = 1.5
-# The voxels cover the organ and this much around it.
-REACH_MM = 6.0
+# The voxels cover the organ and this much around it: more than the widest gap to an element in contact.
+REACH_MM = 11.0
 # Points along each side of an image whose rest positions are sampled.
 GRID_POINTS = 96
 # Least compressed length, as a fraction of the rest length, at which no voxel between two points is missed.

@@ -66,8 +66,9 @@ class Probe(Section):
     edges; sharp ones cut into tissue that they slide over. ``fin_mm``, lateral x elevation x height, is the
     fin on its back by which a grasper holds it, and ``cable_mm`` the diameter of the cable, which leaves the
     end without the mark: both are drawn, but touch nothing; 0 where there is none. ``f_number`` is that of
-    the transmit and of the receive aperture. ``element_height_mm`` and the lens, focused at ``elevation_focus_mm``, shape the beam
-    across the image plane; ``elevation_width_mm`` is the slice thickness that counts as scanned (coverage).
+    the transmit and of the receive aperture. ``element_height_mm`` and the lens, focused at
+    ``elevation_focus_mm``, shape the beam across the image plane; ``elevation_width_mm`` is the slice
+    thickness that counts as scanned (coverage).
     ``bandwidth_percent`` is the -6 dB width of a round trip through the array, relative to the frequency.
     ``noise_db`` is the scanner's electronic noise before gain; 0 dB is the echo of a perfect reflector at the
     face. Its default gives the penetration of laparoscopic probes, 6 to 8 cm at 7.5 MHz, in wavelengths the

@@ -44,6 +44,9 @@ CAPSULE, CAPSULE_TILT, CAPSULE_MIRROR = 0.1, float(np.radians(10)), 0.85
 DISTANCE_ERROR_MM = 2.0
 # What has less impedance is gas: in an empty crater no fluid stays.
 LEAST_FLUID_MRAYL = 0.3
+# The longest way through fluid, relative to its height: on a surface aslant by 45 degrees. On a longer one a
+# scanline passes beside the organ, where nothing holds fluid.
+LONGEST_IN_FLUID = float(np.sqrt(2))
 
 
 @ti.dataclass
@@ -65,7 +68,8 @@ class Propagation:
     element transmits and receives only in contact: with the organ, nearer than ``contact_gap_mm``, or, where
     ``contact`` is "tissue", with anything but gas. ``around`` is the impedance [MRayl] of all that is outside
     the organ; None for what the CT shows there. With ``has_fluid``, what a scanline passes from the array to
-    the organ, nearer than ``contact_gap_mm`` all the way, is irrigation fluid, but no gas.
+    the organ, nearer than ``contact_gap_mm`` all the way, is irrigation fluid, but no gas; at most
+    LONGEST_IN_FLUID of that.
 
     ``tissue`` and ``rest`` (scanlines, samples) are what is there; ``across`` is the rest direction across
     the image plane. ``depth`` is where a sample is [mm]; the scanner shows it where it would be if sound were
@@ -216,6 +220,7 @@ class Propagation:
                     # Where a scanline passes the organ at a distance, what is behind is the organ's
                     # surroundings, no fluid on it.
                     in_front = distance > 0.0 and distance <= self.gap_mm
+                    in_front = in_front and depth <= LONGEST_IN_FLUID * self.gap_mm
                     if in_front and sample.tissue.x > LEAST_FLUID_MRAYL:
                         sample.tissue = tm.vec4(self.fluid)
             self.tissue[line, k] = sample.tissue.xyz
