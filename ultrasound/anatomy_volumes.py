@@ -15,7 +15,7 @@ from ultrasound.scanned_anatomy import ScannedAnatomy, start_acoustics
 # The voxels of a volume that a crater changes, and their values with it; None for no change.
 Change = Callable[[Crater, SampledVolume], tuple[Box, np.ndarray] | None]
 TUMOUR_SPACING_MM = 1.0
-# Distances from the organ are known so far around it: more than the widest gap to an element in contact.
+# Distances from the organ are known so far around it: more than the highest layer of fluid on it.
 ORGAN_REACH_MM = 11.0
 
 

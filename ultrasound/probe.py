@@ -310,6 +310,11 @@ class Probe(Section):
         share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines - 0.5
         return np.column_stack([share * self.transducer_width_mm, np.zeros_like(share)])
 
+    def face_normals(self) -> np.ndarray:
+        """The unit normals of the face at ``elements``, into the tissue, (scanlines, 2)."""
+        straight = np.tile([0.0, 1.0], (self.number_of_scanlines, 1))
+        return straight + self.elements() / self.radius_mm if self.radius_mm > 0 else straight
+
     def line_spacing_mm(self, depth_mm: np.ndarray) -> np.ndarray:
         """The distance of neighbouring scanlines at depths [mm]."""
         if self.transducer_geometry == "LINEAR":
