@@ -8,7 +8,7 @@ import trimesh
 
 from sim.embedding import Unmoved
 from sim.fields import array_of
-from ultrasound.probe import load_probe
+from ultrasound.probe import Probe, load_probe
 from ultrasound.probe_manipulator import image_plane, pose_at
 from ultrasound.scanned_anatomy import ScannedAnatomy
 from ultrasound.scanner import B_MODE, Scanner
@@ -35,13 +35,13 @@ def anatomy() -> ScannedAnatomy:
     return ScannedAnatomy(organ, hu, index_from_mm, labels, tissues, tumour)
 
 
-def scanned(outside: str, gap_mm: float) -> tuple[Scanner, np.ndarray]:
+def scanned(outside: str, gap_mm: float, probe: Probe = PROBE) -> tuple[Scanner, np.ndarray]:
     """The scanner and its B-mode image, where the face touches the organ over the tumour."""
-    scanner = Scanner(anatomy(), Unmoved(), PROBE, PIXELS, outside, contact_gap_mm=gap_mm)
-    length = PROBE.housing_mm[2]
+    scanner = Scanner(anatomy(), Unmoved(), probe, PIXELS, outside, contact_gap_mm=gap_mm)
+    length = probe.housing_mm[2]
     pose = pose_at(np.array([0.0, 0.0, ORGAN_MM]), [0, 0, -1.0], [1.0, 0, 0], length)
-    plane = image_plane(pose, length, *PROBE.extent_mm)
-    return scanner, scanner.images(plane, PROBE, "b-mode", "speckle", 350.0, 40.0).by_name[B_MODE]
+    plane = image_plane(pose, length, *probe.extent_mm)
+    return scanner, scanner.images(plane, probe, "b-mode", "speckle", 350.0, 40.0).by_name[B_MODE]
 
 
 @pytest.fixture(scope="module")
@@ -98,3 +98,14 @@ def test_the_fluid_is_black_and_the_organ_begins_with_a_bright_line(wet):
     organ = (v > surface + 1.5) & (v < surface + 6.0) & (np.abs(u) < 8)
     assert fluid.sum() > 100 and picture[fluid].mean() < 0.1 * picture[organ].mean()
     assert picture[line].max() > 2 * picture[organ].mean()
+
+
+def test_the_same_tissue_is_as_bright_as_under_the_micro_probe(wet):
+    micro = load_probe("micro")
+    means = []
+    for probe, picture in ((PROBE, wet[1]), (micro, scanned("fluid", 8.0, micro)[1])):
+        u = ((np.arange(PIXELS) + 0.5) / PIXELS - 0.5) * probe.array_width_mm
+        v = (np.arange(PIXELS) + 0.5) / PIXELS * probe.depth_mm
+        means.append([picture[np.ix_((v > a) & (v < a + 7), np.abs(u) < 4)].mean() for a in (6, 13, 20, 33)])
+    # Speckle of 8 x 7 mm; in the depth the narrow array has the smaller aperture.
+    assert means[0] == pytest.approx(means[1], rel=0.15) and min(means[0]) > 10
