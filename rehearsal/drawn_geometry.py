@@ -5,9 +5,10 @@ import numpy as np
 from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.live_settings import LiveSettings, initial_settings
 from render.display import window_size
-from render.viewer import Geometry
+from render.viewer import Geometry, TransducerHousing
 from render.window import Window
 from render.window_layout import FULL_SIZE
+from ultrasound.probe import Probe
 
 
 def open_viewer(anatomy: DeformedAnatomy, visible: bool) -> Window[LiveSettings]:
@@ -36,8 +37,7 @@ def drawn_geometry(anatomy: DeformedAnatomy) -> Geometry:
         organ=(anatomy.drawn_organ, faces),
         bounds=case.organ.bounds,
         up=-case.gravity_direction,
-        transducer_size_mm=case.size_mm,
-        transducer_radius_mm=case.probe.radius_mm,
+        transducer=drawn_housing(case.probe),
         tumour=tumour,
         parts={
             tissue: (vertices, np.asarray(anatomy.geometry.parts[tissue].faces, np.int32))
@@ -46,4 +46,11 @@ def drawn_geometry(anatomy: DeformedAnatomy) -> Geometry:
         support=support,
         specimen=specimen,
         bed=bed,
+    )
+
+
+def drawn_housing(probe: Probe) -> TransducerHousing:
+    """What a window draws of a probe."""
+    return TransducerHousing(
+        probe.housing_mm, probe.edge_radius_mm, probe.radius_mm, probe.fin_mm, probe.cable_mm
     )

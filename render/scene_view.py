@@ -53,11 +53,10 @@ class SceneView:
         self._bed = None if geometry.bed is None else ShadedSurface(*geometry.bed, BED)
         if geometry.support is not None:
             self._support = self._matt_support(*geometry.support)
-        self._half_axis_mm = geometry.transducer_size_mm[2] / 2
-        shape = geometry.transducer_size_mm, geometry.transducer_radius_mm
-        self._probe = transducer_shape.transducer(*shape)
+        self._half_axis_mm = geometry.transducer.size_mm[2] / 2
+        self._probe = transducer_shape.transducer(geometry.transducer)
         self._probe_mesh = DrawnMesh(len(self._probe.vertices))
-        self._probe_edges = transducer_shape.edges(*shape)
+        self._probe_edges = transducer_shape.edges(geometry.transducer)
         self._edge_points = field_of(self._probe_edges, within=1)
         # Made when they are first drawn, and for other geometry only once.
         self.plan_lines: PlanLines | None = before.plan_lines if before else None

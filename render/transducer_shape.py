@@ -5,19 +5,25 @@ Local axes: x lateral, to the marked side; y elevation; z along the axis. The im
 z = -size_z / 2 in the direction -z.
 """
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 import trimesh
 
-from render.viewer import View
+from render.viewer import TransducerHousing, View
 
 BODY, LENS, MARKER = (0.60, 0.65, 0.70), (0.16, 0.18, 0.21), (0.25, 0.77, 1.0)
+FIN, CABLE = (0.45, 0.50, 0.55), (0.24, 0.26, 0.30)
 LENS_MM = 2.5
 FRAME_SIDES = 48
 ARC_POINTS = 15
+# Of a rounded edge.
+EDGE_STEPS = 4
+# The cable bends away from the tissue: its radius and angle, the pieces of it, and the sides of a piece.
+BEND_MM, BEND_DEG, CABLE_PIECES, CABLE_SIDES = 45.0, 60.0, 8, 12
 
-_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 _EDGES = np.array(
     [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]]
 )
@@ -31,36 +37,75 @@ class TransducerShape(NamedTuple):
     colours: np.ndarray
 
 
-def _prism(profile: np.ndarray, width: float, colour) -> TransducerShape:
-    """The convex prism of a profile (n, 2) of x and z, centred on y = 0; each triangle has its own
-    vertices.
-    """
-    ends = [np.insert(profile, 1, y, axis=1) for y in (-width / 2, width / 2)]
-    hull = trimesh.convex.convex_hull(np.concatenate(ends))
+def transducer(housing: TransducerHousing) -> TransducerShape:
+    """The housing, its acoustic lens, flat or an arc, a marker on the +x side, and any fin and cable."""
+    x, y, z = housing.size_mm
+    lens = min(LENS_MM, z / 4)
+    curved = _face(x, z, housing.face_radius_mm)
+    top = curved[:, 1].max() + lens
+    middle = (z / 2 + top) / 2
+    marker = _prism(x / 2 + 0.25 * np.array([-1, 1]), middle + 0.225 * z * np.array([-1, 1]), 0.3 * y)
+    if housing.face_radius_mm == 0:
+        body, face = _rounded(housing, top, z / 2), _rounded(housing, -z / 2, top)
+    else:
+        body = _prism(np.array([-x, x]) / 2, np.array([top, z / 2]), y)
+        face = np.concatenate([_extruded(curved, y), _prism(np.array([-x, x]) / 2, np.array([top]), y)])
+    solids = [(body, BODY), (face, LENS), (marker, MARKER)]
+    if all(housing.fin_mm):
+        length, width, height = housing.fin_mm
+        solids.append((_prism(np.array([-length, length]) / 2, z / 2 + np.array([0, height]), width), FIN))
+    if housing.cable_mm > 0:
+        rings = _cable_rings(-x / 2, housing.cable_mm / 2)
+        solids += [(np.concatenate(pair), CABLE) for pair in pairwise(rings)]
+    parts = [_hull(points, colour) for points, colour in solids]
+    return TransducerShape(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def _hull(points: np.ndarray, colour: tuple[float, float, float]) -> TransducerShape:
+    """The convex hull of points (n, 3); each triangle has its own vertices."""
+    hull = trimesh.convex.convex_hull(points)
     colours = np.tile(colour, (3 * len(hull.faces), 1))
     return TransducerShape(hull.triangles.reshape(-1, 3), np.repeat(hull.face_normals, 3, axis=0), colours)
 
 
-def _rectangle(left: float, right: float, bottom: float, top: float) -> np.ndarray:
-    return np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+def _extruded(profile: np.ndarray, width: float) -> np.ndarray:
+    """The vertices of a prism of a profile (n, 2) of x and z, centred on y = 0."""
+    return np.concatenate([np.insert(profile, 1, y, axis=1) for y in (-width / 2, width / 2)])
 
 
-def transducer(size, radius: float = 0.0) -> TransducerShape:
-    """The housing, its acoustic lens, flat or an arc of a radius, and a marker on the +x side."""
-    x, y, z = (float(length) for length in size)
-    lens = min(LENS_MM, z / 4)
-    face = _face(x, z, radius)
-    top = face[:, 1].max() + lens
-    middle = (z / 2 + top) / 2
-    upper = np.array([[x / 2, top], [-x / 2, top]])
-    parts = [
-        _prism(_rectangle(-x / 2, x / 2, top, z / 2), y, BODY),
-        _prism(np.concatenate([face, upper]), y, LENS),
-        _prism(
-            _rectangle(x / 2 - 0.25, x / 2 + 0.25, middle - 0.225 * z, middle + 0.225 * z), 0.3 * y, MARKER
-        ),
-    ]
-    return TransducerShape(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+def _prism(x: np.ndarray, z: np.ndarray, width: float) -> np.ndarray:
+    """The vertices of a cuboid, or rectangle, over all pairs of x and z."""
+    return _extruded(np.array([[a, c] for a in x for c in z]), width)
+
+
+def _rounded(housing: TransducerHousing, low: float, high: float) -> np.ndarray:
+    """The vertices of the housing with rounded edges, between two heights along z."""
+    radius = housing.edge_radius_mm
+    core = np.array(housing.size_mm) / 2 - radius
+    quarter = np.linspace(0, np.pi / 2, EDGE_STEPS + 1)
+    bends = np.concatenate([sign * (core[2] + radius * np.sin(quarter)) for sign in (-1, 1)])
+    heights = np.concatenate([[low, high], bends[(bends > low) & (bends < high)]])
+    reach = np.sqrt(np.maximum(radius**2 - np.maximum(np.abs(heights) - core[2], 0) ** 2, 0))
+    arc = np.column_stack([np.cos(quarter), np.sin(quarter)])
+    corners = [np.array([x, y]) for x in (-1, 1) for y in (-1, 1)]
+    return np.concatenate(
+        [
+            np.insert(corner * (core[:2] + r * arc), 2, z, axis=1)
+            for r, z in zip(reach, heights, strict=True)
+            for corner in corners
+        ]
+    )
+
+
+def _cable_rings(x: float, radius: float) -> list[np.ndarray]:
+    """Circles (CABLE_SIDES, 3) around the cable, which leaves the end of the housing at x."""
+    around = np.linspace(0, 2 * np.pi, CABLE_SIDES, endpoint=False)
+    rings = []
+    for turn in np.radians(np.linspace(0, BEND_DEG, CABLE_PIECES + 1)):
+        centre = np.array([x - BEND_MM * np.sin(turn), 0.0, BEND_MM * (1 - np.cos(turn))])
+        across = np.outer(np.cos(around), [np.sin(turn), 0.0, np.cos(turn)])
+        rings.append(centre + radius * (across + np.outer(np.sin(around), [0.0, 1.0, 0.0])))
+    return rings
 
 
 def _face(x: float, z: float, radius: float) -> np.ndarray:
@@ -71,14 +116,17 @@ def _face(x: float, z: float, radius: float) -> np.ndarray:
     return np.column_stack([across, radius - np.sqrt(np.maximum(radius**2 - across**2, 0)) - z / 2])
 
 
-def edges(size, radius: float = 0.0) -> np.ndarray:
+def edges(housing: TransducerHousing) -> np.ndarray:
     """The end points of the housing's straight edges, shape (24, 3), just outside so that the sides do not
     hide them.
     """
-    x, y, z = (float(length) for length in size)
-    foot = _face(x, z, radius)[:, 1].max()
-    box = np.array([x, y, z / 2 - foot])
-    return (_CORNERS * (box + 0.15) + [0.0, 0.0, (z / 2 + foot) / 2])[_EDGES].reshape(-1, 3)
+    x, y, z = housing.size_mm
+    foot, radius = _face(x, z, housing.face_radius_mm)[:, 1].max(), housing.edge_radius_mm
+    half = np.array([x, y, z / 2 - foot]) / 2 + 0.075
+    ends = _CORNERS[_EDGES]
+    along = ends[:, :1] != ends[:, 1:]
+    inset = np.where(along, radius, radius * (1 - np.sqrt(0.5)))
+    return (ends * (half - inset) + [0.0, 0.0, (z / 2 + foot) / 2]).reshape(-1, 3)
 
 
 def image_plane_grid(rows: int, columns: int) -> np.ndarray:

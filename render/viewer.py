@@ -73,6 +73,22 @@ Surface = tuple[Any, np.ndarray]
 
 
 @dataclass(frozen=True)
+class TransducerHousing:
+    """The transducer as it is drawn. Lengths in mm."""
+
+    size_mm: tuple[float, float, float]
+    """The cuboid: x lateral and to the marked side, y elevation, z axis. The image leaves at z = -size/2."""
+    edge_radius_mm: float = 0.0
+    """Radius of its rounded edges."""
+    face_radius_mm: float = 0.0
+    """Radius of a curved array face, in the x-z plane; 0 where it is flat."""
+    fin_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The fin on its back, along the same axes; 0 where there is none."""
+    cable_mm: float = 0.0
+    """Diameter of the cable, which leaves the end at x = -size/2; 0 where there is none."""
+
+
+@dataclass(frozen=True)
 class Geometry:
     """The geometry of a scene. The application updates the vertices that move."""
 
@@ -81,13 +97,7 @@ class Geometry:
     """Box that the camera frames, minimum and maximum corner [mm], shape (2, 3)."""
     up: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     """Direction opposite to gravity, shape (3,)."""
-    transducer_size_mm: np.ndarray = field(default_factory=lambda: np.array([40.0, 10.0, 20.0]))
-    """The cuboid, shape (3,): x lateral and to the marked side, y elevation, z axis.
-
-    The image leaves at z = -size/2.
-    """
-    transducer_radius_mm: float = 0.0
-    """Radius of a curved array face, in the x-z plane; 0 where it is flat."""
+    transducer: TransducerHousing = TransducerHousing((40.0, 10.0, 20.0))
     tumour: Surface | None = None
     parts: dict[str, Surface] = field(default_factory=dict)
     """Other structures in the organ, by tissue."""

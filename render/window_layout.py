@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-# B-mode and CT of the drop-in probe, 16 x 40 mm each, nearly fill a panel of this fraction of 1280 x 720
-# pixels.
+# The images have this fraction of the window's width, and the 3D view beside them still has room for the
+# read-outs below it.
 PANEL_SHARE = 0.43
 TITLE_HEIGHT, CLOCK_WIDTH = 42, 150
 STRIP_HEIGHT, STRIP_GAP, READOUT_WIDTH = 184, 4, 134

@@ -167,7 +167,7 @@ class Transducer(Section):
     ``force_limit_n``: where the hand asks for more, the probe stays behind it.
     """
 
-    probe: Annotated[str, "--probe"] = "linear"
+    probe: Annotated[str, "--probe"] = "drop-in"
     """Probe, by its name or as a file."""
     size_mm: Annotated[tuple[ProbeLength, ProbeLength, ProbeLength], LIST] | None = None
     speed_mm_s: float = Field(150.0, gt=0, le=2000)
@@ -200,9 +200,10 @@ class Image(Section):
     The default depth is the probe's. An element is in contact where the organ is closer to the array than
     ``contact_gap_mm``; with ``contact`` "tissue", where the CT shows anything but gas. ``outside`` "fluid": a
     layer of irrigation fluid of ``fluid_gap_mm`` covers the organ, through which elements are in contact too;
-    in front of it is gas. Water stays on a surface up to a height of 1.4 times its capillary length, which is
-    2.7 mm. With ``atlas``, what the CT cannot show is drawn from an atlas: pyramids without enhancement, the
-    renal fascia, layers in muscle.
+    in front of it is gas. Between two wet surfaces capillarity alone holds water up to twice its capillary
+    length, 2 x 2.7 mm; the default is an estimate of what it holds while the assistant irrigates: the ends of
+    a flat array of 36 mm are 8 mm above a surface with a radius of 24 mm. With ``atlas``, what the CT cannot
+    show is drawn from an atlas: pyramids without enhancement, the renal fascia, layers in muscle.
     """
 
     mode: Annotated[
@@ -226,7 +227,7 @@ class Image(Section):
     outside: Literal["background", "gel", "air", "fluid"] = "background"
     contact: Literal["organ", "tissue"] = "organ"
     contact_gap_mm: float = Field(1.5, ge=0, le=20)
-    fluid_gap_mm: float = Field(4.0, ge=0, le=5)
+    fluid_gap_mm: float = Field(8.0, ge=0, le=10)
     atlas: Annotated[bool, "--atlas/--no-atlas"] = True
     """Draw from an atlas what the CT cannot show: pyramids without enhancement, the renal fascia, layers in
     muscle.

@@ -15,6 +15,8 @@ from ultrasound.scanned_anatomy import ScannedAnatomy, start_acoustics
 # The voxels of a volume that a crater changes, and their values with it; None for no change.
 Change = Callable[[Crater, SampledVolume], tuple[Box, np.ndarray] | None]
 TUMOUR_SPACING_MM = 1.0
+# Distances from the organ are known so far around it: more than the highest layer of fluid on it.
+ORGAN_REACH_MM = 11.0
 
 
 class AnatomyVolumes:
@@ -56,7 +58,7 @@ class AnatomyVolumes:
     @cached_property
     def organ(self) -> SampledVolume:
         """Signed distance [mm] from the organ's surface, negative inside; a crater with fluid is inside."""
-        return self._with_crater(distance_volume(self.anatomy.organ), _without_air)
+        return self._with_crater(distance_volume(self.anatomy.organ, reach_mm=ORGAN_REACH_MM), _without_air)
 
     @cached_property
     def remnant(self) -> SampledVolume:

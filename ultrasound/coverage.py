@@ -78,19 +78,20 @@ class Coverage:
         """Add an image; return which of its scanlines are in contact.
 
         ``rest_mm`` (n, n, 3) are rest positions at points evenly over the image
-        (``PlaneInTissue.rest_grid``). A scanline is in contact where its element is nearer to the organ than
-        ``gap_mm``; without it, all are.
+        (``PlaneInTissue.rest_grid``). A scanline is in contact where the organ is in front of its element,
+        nearer than ``gap_mm`` (as ``Propagation``); without it, all are.
         """
         count = len(rest_mm)
         lines, in_image = _scanlines_of(probe, count)
         contact = np.ones(probe.number_of_scanlines, bool)
         if gap_mm is not None:
             width, depth, above = probe.extent_mm
-            share = (probe.elements() + [width / 2, above]) / [width, depth]
-            # The grid point nearest to each element.
+            ends = probe.elements() + gap_mm * probe.face_normals()
+            share = (ends + [width / 2, above]) / [width, depth]
+            # The grid point nearest to the end of each gap.
             column, row = np.clip(np.rint(share * (count - 1)).astype(int), 0, count - 1).T
             places = self._indices(rest_mm[row, column]).T
-            contact = map_coordinates(self.distance, places, order=1, mode="constant", cval=np.inf) <= gap_mm
+            contact = map_coordinates(self.distance, places, order=1, mode="constant", cval=np.inf) <= 0
         shown = np.flatnonzero(in_image & contact[lines])
         # In voxels, axis by axis.
         at = ((rest_mm.reshape(-1, 3) - self.origin_mm) / VOXEL_MM).astype(np.float32).T.copy()

@@ -48,6 +48,8 @@ Percent = Annotated[float, Field(ge=0, le=100)]
 Length = Annotated[float, Field(gt=0, le=150)]
 # TOML has lists where Python has tuples.
 Lengths = Annotated[tuple[Length, Length, Length], Field(strict=False)]
+FinLength = Annotated[float, Field(ge=0, le=150)]
+FinLengths = Annotated[tuple[FinLength, FinLength, FinLength], Field(strict=False)]
 Range = Annotated[tuple[float, float], Field(strict=False)]
 Sliders = Annotated[tuple[Percent, ...], Field(strict=False, min_length=TGC_SLIDERS, max_length=TGC_SLIDERS)]
 
@@ -61,9 +63,12 @@ class Probe(Section):
     FrequencyMhz).
 
     ``housing_mm`` is the cuboid in contact: lateral x elevation x length. ``edge_radius_mm`` rounds its
-    edges; sharp ones cut into tissue that they slide over. ``f_number`` is that of the transmit and of the
-    receive aperture. ``element_height_mm`` and the lens, focused at ``elevation_focus_mm``, shape the beam
-    across the image plane; ``elevation_width_mm`` is the slice thickness that counts as scanned (coverage).
+    edges; sharp ones cut into tissue that they slide over. ``fin_mm``, lateral x elevation x height, is the
+    fin on its back by which a grasper holds it, and ``cable_mm`` the diameter of the cable, which leaves the
+    end without the mark: both are drawn, but touch nothing; 0 where there is none. ``f_number`` is that of
+    the transmit and of the receive aperture. ``element_height_mm`` and the lens, focused at
+    ``elevation_focus_mm``, shape the beam across the image plane; ``elevation_width_mm`` is the slice
+    thickness that counts as scanned (coverage).
     ``bandwidth_percent`` is the -6 dB width of a round trip through the array, relative to the frequency.
     ``noise_db`` is the scanner's electronic noise before gain; 0 dB is the echo of a perfect reflector at the
     face. Its default gives the penetration of laparoscopic probes, 6 to 8 cm at 7.5 MHz, in wavelengths the
@@ -82,6 +87,8 @@ class Probe(Section):
     transducer_geometry: Literal["LINEAR", "CURVILINEAR", "PHASED"] = "LINEAR"
     housing_mm: Lengths = (40.0, 10.0, 20.0)
     edge_radius_mm: float = Field(0.0, ge=0, le=20)
+    fin_mm: FinLengths = (0.0, 0.0, 0.0)
+    cable_mm: float = Field(0.0, ge=0, le=20)
     transducer_width_mm: Length = 40.0
     radius_start_mm: float = Field(0.0, ge=0, le=300)
     theta_start_deg: float = Field(0.0, ge=-80, le=0)
@@ -120,12 +127,32 @@ class Probe(Section):
     depth_compensation_db_cm_mhz: float = Field(0.7, ge=0, le=5)
 
     @model_validator(mode="after")
-    def _fits_together(self) -> "Probe":
+    def _fits_its_housing(self) -> "Probe":
+        lateral, elevation, length = self.housing_mm
         if self.edge_radius_mm > min(self.housing_mm) / 2:
             raise ValueError(
                 f"EdgeRadiusMm = {self.edge_radius_mm:g}: expected at most half of the least of HousingMm, "
                 f"{min(self.housing_mm) / 2:g}"
             )
+        if any(self.fin_mm) and not all(self.fin_mm):
+            raise ValueError("FinMm: expected three lengths above 0, or three of 0 for no fin")
+        if self.fin_mm[0] > lateral or self.fin_mm[1] > elevation:
+            raise ValueError(
+                f"FinMm is {self.fin_mm[0]:g} x {self.fin_mm[1]:g} mm across, expected at most the "
+                f"{lateral:g} x {elevation:g} mm of HousingMm"
+            )
+        if self.cable_mm > min(elevation, length):
+            raise ValueError(
+                f"CableMm = {self.cable_mm:g}: expected at most the smaller side of the housing's end, "
+                f"{min(elevation, length):g}"
+            )
+        array = np.ptp(self.elements()[:, 0])
+        if array > lateral:
+            raise ValueError(f"the array is {array:.1f} mm wide, HousingMm {lateral:g}: it must fit in")
+        return self
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Probe":
         low, high = self.frequency_range_mhz
         if not 1 <= low <= self.frequency_mhz <= high <= 40:
             raise ValueError(
@@ -145,11 +172,6 @@ class Probe(Section):
             raise ValueError(
                 f"ColourSteeringDeg = {self.colour_steering_deg:g}: only linear arrays steer Doppler; "
                 "expected 0"
-            )
-        array = np.ptp(self.elements()[:, 0])
-        if array > self.housing_mm[0]:
-            raise ValueError(
-                f"the array is {array:.1f} mm wide, HousingMm {self.housing_mm[0]:g}: it must fit in"
             )
         return self
 
@@ -287,6 +309,11 @@ class Probe(Section):
             return self.scanlines()[0]
         share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines - 0.5
         return np.column_stack([share * self.transducer_width_mm, np.zeros_like(share)])
+
+    def face_normals(self) -> np.ndarray:
+        """The unit normals of the face at ``elements``, into the tissue, (scanlines, 2)."""
+        straight = np.tile([0.0, 1.0], (self.number_of_scanlines, 1))
+        return straight + self.elements() / self.radius_mm if self.radius_mm > 0 else straight
 
     def line_spacing_mm(self, depth_mm: np.ndarray) -> np.ndarray:
         """The distance of neighbouring scanlines at depths [mm]."""

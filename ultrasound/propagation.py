@@ -62,10 +62,11 @@ class Propagation:
 
     ``tissue_volume`` (.., 4) has impedance, attenuation, backscatter and its anisotropy
     (``acoustics.properties``), ``organ`` the signed distance from the organ's surface [mm], both at rest. An
-    element transmits and receives only in contact: with the organ, nearer than ``contact_gap_mm``, or, where
-    ``contact`` is "tissue", with anything but gas. ``around`` is the impedance [MRayl] of all that is outside
-    the organ; None for what the CT shows there. With ``has_fluid``, what a scanline passes from the array to
-    the organ, nearer than ``contact_gap_mm`` all the way, is irrigation fluid, but no gas.
+    element transmits and receives only in contact: where the organ is in front of it, nearer than
+    ``contact_gap_mm``, or, where ``contact`` is "tissue", anything but gas. ``around`` is the
+    impedance [MRayl] of all that is outside the organ; None for what the CT shows there. With ``has_fluid``,
+    what a scanline passes from the array to the organ, nearer than ``contact_gap_mm`` all the way, is
+    irrigation fluid, but no gas.
 
     ``tissue`` and ``rest`` (scanlines, samples) are what is there; ``across`` is the rest direction across
     the image plane. ``depth`` is where a sample is [mm]; the scanner shows it where it would be if sound were
@@ -97,7 +98,9 @@ class Propagation:
         self.lines, samples = probe.number_of_scanlines, probe.number_of_samples_per_scanline
         self.most = samples // STRIDES[1] + 1
         shape = self.lines, self.most
-        self.start, self.direction, self.element = (zeros(self.lines, 2, within=1) for _ in range(3))
+        self.start, self.direction, self.element, self.facing = (
+            zeros(self.lines, 2, within=1) for _ in range(4)
+        )
         self.contact = zeros(self.lines)
         self.tissue, self.rest, self.across = (zeros(*shape, 3, within=1) for _ in range(3))
         self.echo, self.capsule = (zeros(*shape, 4, within=1) for _ in range(2))
@@ -138,6 +141,7 @@ class Propagation:
             (self.start, start),
             (self.direction, direction),
             (self.element, probe.elements()),
+            (self.facing, probe.face_normals()),
             (self.aperture_angle, angle),
             (self.slice_sd, slice_sd_mm),
             (
@@ -171,14 +175,14 @@ class Propagation:
     def _find_contact(self):
         """Set for each element of the array whether it is in contact."""
         for i in range(self.lines):
-            place = self.element[i]
-            if ti.static(not self.by_organ):
-                place.y += 0.5 * self.gap_mm
+            # An organ is thicker than the gap: it is nearer where the end of the gap is in it. Of gas and
+            # tissue in a voxel, half of the gap.
+            place = self.element[i] + ti.static(1.0 if self.by_organ else 0.5) * self.gap_mm * self.facing[i]
             row, column = self.plane.pixel_near(place)
             rest = self.plane.rest_from_plane(row, column) @ tm.vec4(place, 0.0, 1.0)
             near = 0
             if ti.static(self.by_organ):
-                near = self.plane.is_tissue(row, column) and self.organ.sample(rest) <= self.gap_mm
+                near = self.plane.is_tissue(row, column) and self.organ.sample(rest) <= 0.0
             else:
                 near = self.tissue_volume.sample(rest)[0] > 1.0
             self.contact[i] = ti.cast(near, ti.f32)

@@ -36,8 +36,11 @@ class RigidSurrogate:
         self._distance, self._low_mm = distance_grid(
             self.manipulator.vertices, self.manipulator.faces, VOXEL_MM, REACH_MM
         )
-        elements = trial.case.probe.elements()
-        self._elements = elements[np.linspace(0, len(elements) - 1, ELEMENTS).astype(int)]
+        probe, gap_mm = trial.case.probe, trial.case.scene.image.coupling_gap_mm
+        some = np.linspace(0, probe.number_of_scanlines - 1, ELEMENTS).astype(int)
+        self._elements = probe.elements()[some]
+        # Where these are inside the organ, the elements are in contact (as ``Propagation``).
+        self._gap_ends = self._elements + gap_mm * probe.face_normals()[some]
 
     def try_pass(self, kind: PassKind, parameters: np.ndarray) -> TriedPass | None:
         """A pass over the rigid organ; None where the instrument cannot hold it.
@@ -47,20 +50,18 @@ class RigidSurrogate:
         poses = kind.poses(self.manipulator, kind.values(parameters))
         if poses is None or not self.trial.held([poses]).all():
             return None
-        case = self.trial.case
-        planes = image_plane(poses, case.size_mm[2], 1.0, 1.0).world_from_plane
-        outside = self._outside_mm(planes)
-        touches = outside <= case.scene.image.coupling_gap_mm
-        depths = np.maximum(-outside.min(axis=1), 0.0)
+        planes = image_plane(poses, self.trial.case.size_mm[2], 1.0, 1.0).world_from_plane
+        touches = self._outside_mm(planes, self._gap_ends) <= 0
+        depths = np.maximum(-self._outside_mm(planes, self._elements).min(axis=1), 0.0)
         return self.trial.tried(
             parameters, poses, self._covered(planes, touches), depths, touches.mean(axis=1)
         )
 
-    def _outside_mm(self, planes: np.ndarray) -> np.ndarray:
-        """The signed distance (n, k) of each element on planes (n, 4, 4) from the settled surface,
-        negative inside.
+    def _outside_mm(self, planes: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """The signed distance (n, k) of points (k, 2) on planes (n, 4, 4) from the settled surface, negative
+        inside.
         """
-        places = np.einsum("kj,nij->nki", self._elements, planes[:, :3, :2]) + planes[:, None, :3, 3]
+        places = np.einsum("kj,nij->nki", points, planes[:, :3, :2]) + planes[:, None, :3, 3]
         at = ((places - self._low_mm) / VOXEL_MM).reshape(-1, 3).T
         return map_coordinates(self._distance, at, order=1, mode="nearest").reshape(places.shape[:2])
 

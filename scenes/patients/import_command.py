@@ -78,7 +78,7 @@ PROBE_FILE = "probe.toml"
     metavar="NAME|FILE",
     default="drop-in",
     show_default=True,
-    help="The probe, by name (drop-in, linear, curvilinear, phased) or in a file, which is copied.",
+    help="The probe, by name (drop-in, micro, linear, curvilinear, phased) or in a file, which is copied.",
 )
 @click.option(
     "--uniform",

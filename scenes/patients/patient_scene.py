@@ -33,7 +33,7 @@ LEAST_MEDIAL = 0.3
 STIFF_OR_SOFT: tuple[PartName, ...] = ("sinus", "urine", "cyst", "tumour")
 PROBE = "drop-in"
 # The housing of ``drop-in``, lateral x elevation x length.
-HOUSING_MM = (16.0, 9.0, 6.0)
+HOUSING_MM = (42.0, 9.0, 7.5)
 
 
 def hilum(organ: trimesh.Trimesh, side: Side) -> tuple[float, float, float]:

@@ -27,7 +27,7 @@ from rehearsal.planning.plan_guidance import ABOVE_MM, AHEAD, DEG_PER_MM_OFF, NE
 from render import scene_view, transducer_shape
 from render.keys import begin
 from render.scene_view import DONE, TO_GO, PlanLines
-from render.viewer import Controls, Guidance
+from render.viewer import Controls, Guidance, TransducerHousing
 from sim.fields import Field, array_of
 from ultrasound.probe_manipulator import advanced
 from ultrasound.target import Target
@@ -263,7 +263,7 @@ class Drawn:
         self.given.append((array_of(points).astype(float), colours))
 
 
-EDGES = transducer_shape.edges(SIZE, 0.0)
+EDGES = transducer_shape.edges(TransducerHousing(tuple(SIZE)))
 
 
 def drawn(lines: PlanLines, guidance: Guidance) -> tuple[np.ndarray, np.ndarray, list]:

@@ -198,10 +198,10 @@ def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys, monkeypat
     shown = {path.stem: np.asarray(Image.open(path)).astype(int) for path in out.glob("*.png")}
     row = report["pictures"][0]
     rows, columns = shown["on-b-mode"].shape
-    assert (rows * row["row_mm"], columns * row["column_mm"]) == pytest.approx((40.0, 16.0))
+    assert (rows * row["row_mm"], columns * row["column_mm"]) == pytest.approx((50.0, 36.0))
     image_to_probe = np.array(row["image_to_probe"])
     corners = image_to_probe @ np.array([[-0.5, -0.5, 0, 1], [columns - 0.5, rows - 0.5, 0, 1]]).T
-    assert pytest.approx(np.array([[-8.0, 0.0], [8.0, 40.0]])) == corners[:2].T
+    assert pytest.approx(np.array([[-18.0, 0.0], [18.0, 50.0]])) == corners[:2].T
     assert np.array(row["probe_to_patient"]) == pytest.approx(pose_on_tumour())
     # Without contact there is electronic noise, and the vibration of the array near its face.
     assert (
@@ -259,7 +259,10 @@ def test_an_unknown_probe_is_named_with_those_that_are_known_and_poses_that_are_
     deep[:3, 3] = [69.7, 26.8, -341.1]
     assert scan_of_one_pose(tmp_path, deep, "--probe", "x.toml") == 2
     told = capsys.readouterr()
-    assert "known by name are curvilinear, drop-in, linear, phased" in told.err and "1 of 1 poses" in told.out
+    assert (
+        "known by name are curvilinear, drop-in, linear, micro, phased" in told.err
+        and "1 of 1 poses" in told.out
+    )
 
 
 def test_a_label_of_no_known_tissue_is_refused_in_one_line(tmp_path, capsys):
@@ -287,7 +290,7 @@ def test_a_label_of_no_known_tissue_is_refused_in_one_line(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("contact", "outside", "has_fluid", "gap_mm"),
     [
-        ("organ", "fluid", True, 4.0),
+        ("organ", "fluid", True, 8.0),
         ("tissue", "fluid", False, 1.5),
         ("organ", "background", False, 1.5),
     ],

@@ -29,6 +29,7 @@ from render.viewer import SCANNER_GROUPS, Geometry, View
 from render.warning_box import warning_lines, warning_rect
 from render.window_layout import Rect, WindowLayout
 from scenes.tissue import NeoHookeanTissue, ShapeMatchingTissue
+from ultrasound.probe import load_probe
 
 LAYOUT = WindowLayout(1280, 720)
 AXES = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, 1.0, 0]])
@@ -102,9 +103,12 @@ def test_no_part_of_the_window_overlaps_another(size, doppler):
             assert area.top <= box.top and box.bottom <= area.bottom
 
 
-def test_b_mode_and_ct_of_the_drop_in_probe_fill_the_panel():
-    box = image_boxes(LAYOUT)[0]
-    assert box.height > 0.95 * (720 - 74 - 52) and LAYOUT.scene.width > 720
+@pytest.mark.parametrize("name", ["drop-in", "micro"])
+def test_b_mode_and_ct_of_a_drop_in_probe_fill_the_panel(name):
+    width, depth, _ = load_probe(name).extent_mm
+    first, last = LAYOUT.image_boxes(2, width, depth)
+    across = (last.right - first.left) / (LAYOUT.panel.width - 42 - 30)
+    assert max(across, first.height / (720 - 74 - 52)) > 0.95 and LAYOUT.scene.width > 720
 
 
 @each_size

@@ -15,6 +15,7 @@ import trimesh
 from conftest import ROOT
 from settings_at_start import settings_with
 
+from rehearsal.drawn_geometry import drawn_housing
 from rehearsal.live_settings import DEFAULT_KEYS
 from render import background_image, display, transducer_shape, ultrasound_panel
 from render.camera import OrbitCamera
@@ -22,12 +23,13 @@ from render.cut_face import FLESH
 from render.display import display_available, fitted, scale_of, window_size
 from render.sliders import boxes_of, draw_sliders
 from render.software_scene import SoftwareScene
-from render.viewer import Geometry, View
+from render.viewer import Geometry, TransducerHousing, View
 from render.warning_box import warning_image, warning_rect
 from render.window_layout import FULL_SIZE, WindowLayout
 from settings import with_values
 from sim.device import start
 from sim.fields import fill, fill_evenly, zeros
+from ultrasound.probe import load_probe
 
 BOUNDS = np.array([[-54.0, -33.0, -21.0], [54.0, 27.0, 21.0]])
 LAYOUT = WindowLayout(1280, 720)
@@ -109,14 +111,27 @@ def test_up_is_up_and_the_tissue_follows_a_pan():
 # Solids
 
 
-@pytest.mark.parametrize("radius", [0.0, 25.0])
-def test_the_parts_of_the_transducer_are_closed_and_face_outward(radius):
-    size = np.array([40.0, 10.0, 20.0])
-    shape = transducer_shape.transducer(size, radius)
-    faces = np.arange(len(shape.vertices)).reshape(-1, 3)
-    for colour in (transducer_shape.BODY, transducer_shape.LENS, transducer_shape.MARKER):
-        part = faces[(shape.colours[faces[:, 0]] == colour).all(axis=1)]
-        corners, normals = shape.vertices[part], shape.normals[part]
+HOUSINGS = {
+    "flat": TransducerHousing((40.0, 10.0, 20.0)),
+    "curved": TransducerHousing((40.0, 10.0, 20.0), face_radius_mm=25.0),
+    "drop-in": drawn_housing(load_probe("drop-in")),
+}
+PARTS = {name: getattr(transducer_shape, name) for name in ("BODY", "LENS", "MARKER", "FIN")}
+
+
+def solids_of(housing: TransducerHousing) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Corners and normals (n, 3, 3) of the triangles of each part that is one convex solid."""
+    shape = transducer_shape.transducer(housing)
+    corners, normals = shape.vertices.reshape(-1, 3, 3), shape.normals.reshape(-1, 3, 3)
+    own = {name: (shape.colours[::3] == colour).all(axis=1) for name, colour in PARTS.items()}
+    return {name: (corners[part], normals[part]) for name, part in own.items() if part.any()}
+
+
+@pytest.mark.parametrize("housing", HOUSINGS.values(), ids=HOUSINGS)
+def test_the_parts_of_the_transducer_are_closed_and_face_outward(housing):
+    size, solids = np.array(housing.size_mm), solids_of(housing)
+    assert ("FIN" in solids) == all(housing.fin_mm)
+    for corners, normals in solids.values():
         middle = corners.reshape(-1, 3).mean(axis=0)
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         assert np.all(np.einsum("ij,ij->i", cross, corners.mean(axis=1) - middle) > 0)
@@ -125,8 +140,33 @@ def test_the_parts_of_the_transducer_are_closed_and_face_outward(radius):
         assert cross.sum(axis=0) == pytest.approx(np.zeros(3), abs=1e-9)
     # The marker stands out by a quarter of a millimetre; a curved array is lowest in its centre, where the
     # image starts.
-    assert shape.vertices.min(axis=0) == pytest.approx(-size / 2)
-    assert shape.vertices.max(axis=0)[:2] == pytest.approx(size[:2] / 2 + [0.25, 0.0])
+    own = np.concatenate([solids[name][0].reshape(-1, 3) for name in ("BODY", "LENS", "MARKER")])
+    assert own.min(axis=0) == pytest.approx(-size / 2)
+    assert own.max(axis=0)[:2] == pytest.approx(size[:2] / 2 + [0.25, 0.0])
+
+
+def test_the_edges_of_the_drawn_housing_are_as_round_as_those_in_contact():
+    """Each vertex is on the surface of the union of all balls within the half-spaces."""
+    housing = HOUSINGS["drop-in"]
+    solids, core = solids_of(housing), np.array(housing.size_mm) / 2 - housing.edge_radius_mm
+    outer = np.concatenate([solids[name][0].reshape(-1, 3) for name in ("BODY", "LENS")])
+    beyond = np.linalg.norm(np.maximum(np.abs(outer) - core, 0), axis=1)
+    assert beyond == pytest.approx(np.full(len(outer), housing.edge_radius_mm), abs=1e-6)
+
+
+def test_the_fin_is_on_the_back_and_the_cable_leaves_the_end_without_the_mark():
+    housing = HOUSINGS["drop-in"]
+    x, _, z = housing.size_mm
+    fin = solids_of(housing)["FIN"][0].reshape(-1, 3)
+    assert np.ptp(fin, axis=0) == pytest.approx(housing.fin_mm) and fin[:, 2].min() == pytest.approx(z / 2)
+    shape = transducer_shape.transducer(housing)
+    cable = shape.vertices[(shape.colours == transducer_shape.CABLE).all(axis=1)]
+    first = cable[cable[:, 0] > -x / 2 - 1e-9]
+    assert cable[:, 0].max() == pytest.approx(-x / 2) and np.ptp(first[:, 2]) == pytest.approx(
+        housing.cable_mm
+    )
+    # It bends away from the tissue.
+    assert cable[:, 2].min() >= -z / 2 and cable[:, 0].min() < -x and cable[:, 2].max() > 2 * z
 
 
 def test_the_image_plane_shows_the_image_in_the_right_orientation():

@@ -18,7 +18,7 @@ from PIL import Image
 from settings_at_start import settings_with
 
 from render.ultrasound_panel import OUTLINE, draw_segments, image_boxes, paste_image
-from render.viewer import Geometry, View
+from render.viewer import Geometry, TransducerHousing, View
 from render.window_layout import WindowLayout
 from sim.device import start
 from sim.embedding import Embedding
@@ -166,7 +166,7 @@ def window(scene):
     geometry = Geometry(
         (scene.surface.vertices, organ.faces.astype(np.int32)),
         np.array([[-FRAMED] * 3, [FRAMED] * 3]),
-        transducer_size_mm=np.array([WIDTH, 10.0, 20.0]),
+        transducer=TransducerHousing((WIDTH, 10.0, 20.0)),
         tumour=(scene.tumour.vertices, TUMOUR_SURFACE.faces.astype(np.int32)),
     )
     try:

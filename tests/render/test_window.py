@@ -34,7 +34,7 @@ PANEL, SCENE = np.s_[70:310, 400:620], np.s_[40:240, 10:360]
 STILL = 0.5
 # Two points on the B-mode image beside the CT.
 MARKS = ((200, 130), (290, 130), (245, 165))
-B_MODE_TOP, B_MODE_FOOT = (460, 90), (460, 230)
+B_MODE_TOP, B_MODE_FOOT = (450, 70), (450, 195)
 
 
 class Screen:

@@ -263,7 +263,7 @@ class TestProbeAndStiffness:
         ("name", "words"),
         [
             ("dropin", "--probe: 'dropin' is no file, and known by name are curvilinear, drop-in, linear, "
-            "phased"),
+            "micro, phased"),
             ("none.toml", "--probe: 'none.toml' is no file"),
             ("bad.toml", "TransducerWidthMm"),
             ("folder", "folder"),

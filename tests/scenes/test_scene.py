@@ -301,11 +301,16 @@ def test_a_scenes_probes_file_lies_beside_it(tmp_path, monkeypatch):
     "size_mm, depth_mm, words",
     [
         (
-            (16.0, 2.0, 20.0),
+            (42.0, 3.0, 20.0),
             None,
-            r"^transducer.size_mm = \[16.0, 2.0, 20.0\] does not fit the probe Drop-in.*EdgeRadiusMm = 1.5",
+            r"^transducer.size_mm = \[42.0, 3.0, 20.0\] does not fit the probe Drop-in.*EdgeRadiusMm = 2",
         ),
-        ((12.0, 9.0, 6.0), 50.0, r"image.depth_mm = 50.0.*the array is 15.9 mm wide, HousingMm 12"),
+        (
+            (12.0, 9.0, 6.0),
+            50.0,
+            r"image.depth_mm = 50.0.*FinMm is 18 x 2 mm across, expected at most the 12",
+        ),
+        ((30.0, 9.0, 6.0), 50.0, r"image.depth_mm = 50.0.*the array is 35.8 mm wide, HousingMm 30"),
     ],
 )
 def test_a_size_that_does_not_fit_the_probe_is_refused(size_mm, depth_mm, words):
@@ -315,13 +320,13 @@ def test_a_size_that_does_not_fit_the_probe_is_refused(size_mm, depth_mm, words)
     )
     with pytest.raises(ProbeError, match=words):
         probe_of(changed)
-    fits = scene.model_copy(update=dict(transducer=Transducer(probe="drop-in", size_mm=(18.0, 10.0, 22.0))))
-    assert probe_of(fits).housing_mm == (18.0, 10.0, 22.0)
+    fits = scene.model_copy(update=dict(transducer=Transducer(probe="drop-in", size_mm=(38.0, 10.0, 22.0))))
+    assert probe_of(fits).housing_mm == (38.0, 10.0, 22.0)
 
 
 def test_fluid_couples_as_far_as_it_reaches():
     dry, wet = Image(), Image(outside="fluid")
-    assert dry.coupling_gap_mm == dry.contact_gap_mm == 1.5 and wet.coupling_gap_mm == wet.fluid_gap_mm == 4.0
+    assert dry.coupling_gap_mm == dry.contact_gap_mm == 1.5 and wet.coupling_gap_mm == wet.fluid_gap_mm == 8.0
     assert Image(outside="fluid", fluid_gap_mm=0.5).coupling_gap_mm == 1.5
     assert Image(fluid_gap_mm=3.0).coupling_gap_mm == 1.5
 
@@ -331,7 +336,7 @@ def test_fluid_couples_as_far_as_it_reaches():
     [
         ('outside = "fluid"\ncontact = "tissue"', 'image.contact is "tissue": set it to "organ"'),
         ('outside = "water"', "image.outside"),
-        ('outside = "fluid"\nfluid_gap_mm = 6.0', "image.fluid_gap_mm"),
+        ('outside = "fluid"\nfluid_gap_mm = 11.0', "image.fluid_gap_mm"),
         ('outside = "fluid"\nfluid_gap_mm = -1.0', "image.fluid_gap_mm"),
     ],
 )

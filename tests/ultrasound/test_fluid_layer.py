@@ -125,7 +125,8 @@ def test_over_a_slope_those_near_enough_are_coupled_and_the_others_are_dark(one_
     tank.fill(backscatter=0.1)
     probe = probe_of()
     tank.look(probe, "speckle", at=(0, -gap, 0))
-    distance = probe.elements()[:, 0] * np.sin(slope) + gap * np.cos(slope)
+    # Along the beam.
+    distance = probe.elements()[:, 0] * np.tan(slope) + gap
     contact = array_of(tank.bmode.sound.contact)
     sure = np.abs(distance - GAP_MM) > 0.05
     np.testing.assert_array_equal(contact[sure], (distance <= GAP_MM)[sure])
@@ -133,6 +134,15 @@ def test_over_a_slope_those_near_enough_are_coupled_and_the_others_are_dark(one_
     decibel = array_of(tank.bmode.decibel)
     near, far = decibel[:40, 40:120].mean(), decibel[-20:, 40:120].mean()
     assert near - far > 60
+
+
+def test_an_element_beside_the_organ_is_not_coupled(one_device):
+    """Though it is nearer to the organ than the layer reaches: the organ is not in front of it."""
+    tank = wet(flat_tank(0.5), lambda x, y: np.maximum(x, -y))
+    tank.fill()
+    probe = probe_of()
+    tank.look(probe, at=(0, -1.0, 0))
+    assert (array_of(tank.bmode.sound.contact) == (probe.elements()[:, 0] < 0)).all()
 
 
 def test_inside_the_gap_it_is_as_gel_of_the_same_values(one_device):

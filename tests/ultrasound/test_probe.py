@@ -38,7 +38,7 @@ def test_the_programs_own_probes_load(name):
 
 
 def test_a_probe_of_each_geometry_comes_along():
-    assert "drop-in" in KNOWN
+    assert {"drop-in", "micro"} <= set(KNOWN)
     assert {load_probe(name).transducer_geometry for name in KNOWN} == set(GEOMETRIES)
 
 
@@ -71,6 +71,18 @@ WRONG = {
     "an array wider than its housing": (
         GOOD + "TransducerWidthMm = 50\n",
         "the array is 49.7 mm wide, HousingMm 40: it must fit in",
+    ),
+    "a fin without a height": (
+        GOOD + "FinMm = [18, 2, 0]\n",
+        "FinMm: expected three lengths above 0, or three of 0 for no fin",
+    ),
+    "a fin wider than its housing": (
+        GOOD + "FinMm = [18, 12, 3]\n",
+        "FinMm is 18 x 12 mm across, expected at most the 40 x 10 mm of HousingMm",
+    ),
+    "a cable thicker than its housing": (
+        GOOD + "CableMm = 11\n",
+        "CableMm = 11: expected at most the smaller side of the housing's end, 10",
     ),
     "an unknown geometry": (
         GOOD + 'TransducerGeometry = "CONVEX"\n',
@@ -167,6 +179,15 @@ def test_beam_coordinates_invert_the_scanlines(geometry, steering):
     # Neighbouring lines are as far apart as is said: the chord is 1 - step^2 / 24 of the arc.
     apart = np.linalg.norm(np.diff(place, axis=0), axis=-1)
     assert apart == pytest.approx(np.tile(probe.line_spacing_mm(along[0]), (LINES - 1, 1)), rel=1e-5)
+
+
+@pytest.mark.parametrize("geometry", GEOMETRIES)
+def test_face_normals_are_perpendicular_to_the_face(geometry):
+    probe = probe_of(geometry)
+    elements, normals = probe.elements(), probe.face_normals()
+    along = np.gradient(elements, axis=0)
+    assert np.linalg.norm(normals, axis=1) == pytest.approx(np.ones(LINES)) and (normals[:, 1] > 0).all()
+    assert np.einsum("ij,ij->i", along, normals)[1:-1] == pytest.approx(np.zeros(LINES - 2), abs=1e-9)
 
 
 def test_angles_of_compounding_are_around_that_of_the_probe_which_is_the_first():
