@@ -73,7 +73,7 @@ class ProbeEnvironment(gymnasium.Env[Observation, np.ndarray]):
         trial.begin(SPEED_MM_S)
         manipulator.state = ManipulatorState()
         manipulator.slide(*self.np_random.uniform(-BEGINS_WITHIN_MM, BEGINS_WITHIN_MM, 2))
-        self._rehearsal.organ.pose = manipulator.pose()
+        self._rehearsal.organ.place(manipulator.pose())
         self._poses, self._score = [], 0.0
         trial.move(manipulator.pose(), manipulator.pose())
         self._measured()

@@ -6,6 +6,7 @@ import numpy as np
 
 from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.live_settings import LiveSettings
+from rehearsal.loop.frame import LEAST_LAG_MM
 from rehearsal.stopwatch import timed
 from render.viewer import View
 from ultrasound.doppler import scale_colours
@@ -54,6 +55,7 @@ def image_view(
     width, depth, above = probe.extent_mm
     return View(
         transducer_pose=anatomy.pose,
+        hand_pose=anatomy.frame.hand if anatomy.frame.lag_mm > LEAST_LAG_MM else None,
         images=made,
         doppler=doppler,
         scale=scale_texts(probe, settings.scanner.doppler) if doppler is not None else ("", ""),

@@ -39,11 +39,11 @@ from ultrasound.probe_manipulator import advanced, array_face_centre, poses_betw
 
 AWAY_MM = 200.0
 # How deep the probe may move into the tissue in a step, before the tissue yields.
-MOST_PENETRATION_MM = 0.5
+MOST_PENETRATION_MM = 0.8
 # Force of a probe that only touches.
 TOUCH_N = 0.1
-# Stiffness of the virtual coupling of hand and probe: the nearer the force is to its limit, the less the probe
-# may move on in a step.
+# Stiffness of the virtual coupling of hand and probe: the nearer the force is to its limit, the less the
+# probe may move on in a step.
 COUPLING_N_MM = 5.0
 
 
@@ -75,7 +75,7 @@ class PressedOrgan:
         self.divergence_check = DivergenceCheck(self.solver)
         self.notice = ""
         self.steps = 0
-        self.pose = self.hand = advanced(case.press_pose, -AWAY_MM)
+        self.place(advanced(case.press_pose, -AWAY_MM))
 
     def _build_solver(self, serial: bool | None) -> None:
         case = self.case
@@ -227,8 +227,8 @@ class PressedOrgan:
         iterations: int | None = None,
         presses: bool = True,
     ) -> tuple[float, np.ndarray | None]:
-        """As ``advance``, by a step of a length [s] with so many iterations, where given; return the time that it
-        took [ms], and the wrench.
+        """As ``advance``, by a step of a length [s] with so many iterations, where given; return the time
+        that it took [ms], and the wrench.
         """
         took_ms: list[float] = []
         with self.step_of(length_s or self.settings.time_step_s, iterations or self.settings.iterations):
@@ -247,6 +247,10 @@ class PressedOrgan:
             return None
         return self.contacts.wrench(self.tool, array_face_centre(self.pose, self.case.size_mm[2]))
 
+    def place(self, pose: np.ndarray) -> None:
+        """Have the transducer at a pose (4, 4) at once, where no tissue is."""
+        self.pose = self.hand = pose
+
     def snapshot(self) -> OrganState:
         """A copy of the present state."""
         return OrganState(self.solver.snapshot(), self.divergence_check.state, self.pose, self.steps)
@@ -255,7 +259,7 @@ class PressedOrgan:
         """Restore a state; the steps that follow give the same bits as before."""
         self.solver.restore(state.solver)
         self.divergence_check.state = state.divergence
-        self.pose = self.hand = state.pose
+        self.place(state.pose)
         self.steps = state.steps
 
     def store_valid_state(self) -> None:
@@ -293,8 +297,8 @@ class PressedOrgan:
 
 
 def within_force(pose: np.ndarray, goal: np.ndarray, force_n: np.ndarray, limit_n: float) -> np.ndarray:
-    """A goal (4, 4) of the transducer at a pose (4, 4) [mm], moved so that the force (3,) [N] of the tissue on it
-    stays within a limit.
+    """A goal (4, 4) of the transducer at a pose (4, 4) [mm], moved so that the force (3,) [N] of the tissue
+    on it stays within a limit.
     """
     size_n = float(np.linalg.norm(force_n))
     if size_n < 1e-9:

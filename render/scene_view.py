@@ -27,6 +27,8 @@ MAX_SEGMENTS = 2000
 TO_GO, DONE = np.array([1.0, 0.93, 0.17], np.float32), np.array([0.30, 0.75, 0.42], np.float32)
 GOAL = (1.0, 0.86, 0.45)
 PLAN_WIDTH, GOAL_WIDTH = 2.6, 1.8
+# The hand, where the probe stays behind it.
+GHOST, GHOST_WIDTH = (0.98, 0.55, 0.20), 1.8
 SPECIMEN, BED = (0.72, 0.45, 0.38), (0.86, 0.56, 0.47)
 # The score: a line over the capsule, red where it is too near to the tumour, and its marks as small crosses.
 SCORED, NEAR = np.array([0.61, 0.77, 1.0], np.float32), np.array([0.98, 0.23, 0.18], np.float32)
@@ -57,7 +59,7 @@ class SceneView:
         self._probe = transducer_shape.transducer(geometry.transducer)
         self._probe_mesh = DrawnMesh(len(self._probe.vertices))
         self._probe_edges = transducer_shape.edges(geometry.transducer)
-        self._edge_points = field_of(self._probe_edges, within=1)
+        self._edge_points, self._ghost_points = (field_of(self._probe_edges, within=1) for _ in range(2))
         # Made when they are first drawn, and for other geometry only once.
         self.plan_lines: PlanLines | None = before.plan_lines if before else None
         self.score_lines: ScoreLines | None = before.score_lines if before else None
@@ -98,6 +100,9 @@ class SceneView:
             self._specimen.shade(eye, key)
             self._specimen.draw(scene)
         self._draw_transducer(scene, view.transducer_pose)
+        if view.hand_pose is not None:
+            fill((self._ghost_points, transducer_shape.placed(self._probe_edges, view.hand_pose)))
+            scene.lines(self._ghost_points, GHOST_WIDTH, color=GHOST)
         inner = self._inner(view, shown)
         cut = self._draw_cut_face(scene, view, inner, eye, key) if shown.cut else None
         if cut is None:

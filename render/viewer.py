@@ -148,6 +148,8 @@ class View:
     """
     width_mm: float
     depth_mm: float
+    hand_pose: np.ndarray | None = None
+    """The pose (4, 4) that the hand asks for, where the transducer stays behind it: drawn as a ghost."""
     doppler: np.ndarray | None = None
     """The first image with Doppler over it, uint8, shape (rows, columns, 3)."""
     scale: tuple[str, str] = ("", "")

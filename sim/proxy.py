@@ -1,8 +1,8 @@
-"""The proxy of a tool (god object: Zilles and Salisbury 1995, with six degrees of freedom Ortega et al. 2007):
-the pose that the tissue lets a tool have, where a hand wants it elsewhere.
+"""The proxy of a tool (god object: Zilles and Salisbury 1995, with six degrees of freedom Ortega et al.
+2007): the pose that the tissue lets a tool have, where a hand wants it elsewhere.
 
-The tool moves towards its goal in small increments, and is moved out of the tissue after each: no point of the
-surface is ever deep in the tool, nor passed by it.
+The tool moves towards its goal in small increments, and is moved out of the tissue after each: no point of
+the surface is ever deep in the tool, nor passed by it.
 """
 
 from typing import Any
@@ -16,10 +16,12 @@ from sim.fields import array_of, fill, zeros
 from sim.kernels import kernel
 from sim.shapes import FAR, ConvexTool
 
-# No point of a tool moves further than this between two tests of contact: less than half of the thinnest tool.
+# No point of a tool moves further than this between two tests of contact: less than half of the thinnest
+# tool.
 INCREMENT_MM = 1.0
 MOST_INCREMENTS = 1000
-# In contact it moves no further than this at a time: its path is bent, and the solver takes it to be straight.
+# In contact it moves no further than this at a time: its path is bent, and the solver takes it to be
+# straight.
 MOST_CONTACT_PATH_MM = 10.0
 # The points deepest in the tool are moved out one after the other, at most so many in an increment.
 PROJECTIONS = 8
@@ -69,13 +71,15 @@ class Proxy:
             length = ti.max(shift.norm() + turn.norm() * self.tool.ball_mm, 1e-6)
             count = self.gather_near(length)
             reached, share, retreat, clearance = tm.vec4(0.0), 0.0, tm.vec3(0.0), 0.0
-            for increment in range(MOST_INCREMENTS):
+            # Where the tissue itself has moved into the tool, this gets no worse at least.
+            least = ti.min(-TOLERANCE_MM, self.deepest(self.start[None], retreat, count).w + most_mm)
+            for _increment in range(MOST_INCREMENTS):
                 is_free = retreat.norm_sqr() == 0.0 or share * length < MOST_CONTACT_PATH_MM
-                if share < 1.0 and clearance >= 0.0 and is_free:
-                    share = ti.min(1.0, share + (INCREMENT_MM + clearance) / length)
+                if share < 1.0 and clearance >= least and is_free:
+                    share = ti.min(1.0, share + (INCREMENT_MM + ti.max(clearance, 0.0)) / length)
                     back = self.retreat(self.moved(share, shift, turn), retreat, count, most_mm)
                     retreat, clearance = back.xyz, back.w
-                    if clearance >= 0.0:
+                    if clearance >= least:
                         reached = tm.vec4(share, retreat)
             self.reached[None] = reached
 
@@ -117,7 +121,7 @@ class Proxy:
                     normal, axis, by = deepest.xyz, pose[:3, 2], ROUNDING_MM - clearance
                     along = -normal.dot(axis)
                     retreat += by / along * axis if along > LEAST_ALONG_AXIS else -by * normal
-        return tm.vec4(retreat, 0.0 if -TOLERANCE_MM < clearance < 0.0 else clearance)
+        return tm.vec4(retreat, clearance)
 
     @ti.func
     def deepest(self, pose, retreat, count):

@@ -28,8 +28,8 @@ TANGENTIAL_RATIO = 0.5
 REUSE_MM = 0.15
 # Points nearer than this to a shape may touch it within the step.
 NEAR_MM = 3.0
-# A point deeper in a tool than this, or that passes one on a longer path, leaves it by the side that it came by:
-# the nearest side may be another one.
+# A point deeper in a tool than this, or that passes one on a longer path, leaves it by the side that it came
+# by: the nearest side may be another one.
 DEEP_MM = 0.5
 # Forces are summed in blocks of this many points, in an order that does not depend on threads.
 BLOCK = 64
@@ -156,7 +156,9 @@ class SurfaceContacts:
 
     @ti.func
     def nearest(self, s: ti.template(), q, p):
-        """Find the contact plane of shape s that is nearest to point q at p; return place and distance [mm]."""
+        """Find the contact plane of shape s that is nearest to point q at p; return place and distance
+        [mm].
+        """
         surface = self.shapes[s].surface(p)
         query = tm.vec4(p, ti.min(surface.w, REACH_MM))
         self.last_query[s, q] = query

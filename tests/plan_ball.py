@@ -127,4 +127,4 @@ def guide_over_ball(plan: Plan) -> PlanGuidance:
 
 def frame_at(pose: np.ndarray, number: int = 0, time_s: float = 0.0, *events: Event) -> Frame:
     """A frame without tissue."""
-    return Frame(number, time_s, pose, np.zeros((0, 3), np.float32), geometry=None, events=events)
+    return Frame(number, time_s, pose, pose, np.zeros((0, 3), np.float32), geometry=None, events=events)

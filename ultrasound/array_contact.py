@@ -2,11 +2,15 @@
 
 from dataclasses import dataclass
 
+import igl
 import numpy as np
 
+from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import sagitta
 
 SPACING_MM = 0.75
+# Points along each side of the footprint.
+FOOTPRINT_POINTS = 9
 # The surface is in contact where it is nearer to the face than this; contacts prevent more penetration.
 CONTACT_MM = 0.5
 # Barycentric tolerance: no gaps between triangles from rounding.
@@ -33,6 +37,35 @@ def face_points(size_mm: np.ndarray, radius_mm: float) -> tuple[np.ndarray, np.n
     points = np.column_stack([x, y, sagitta(x, radius_mm) - size_mm[2] / 2])
     slope = np.ones_like(x) if radius_mm == 0 else radius_mm / np.sqrt(np.maximum(radius_mm**2 - x**2, 1e-6))
     return points, slope * np.prod(np.asarray(size_mm[:2]) / counts)
+
+
+def footprint(probe: Probe) -> np.ndarray:
+    """The centre, edges and corners of the array face, and points between them (n, 3), in the transducer's
+    axes [mm]; on rounded edges.
+    """
+    half, rounded = np.array(probe.housing_mm) / 2, probe.edge_radius_mm
+    x, y = np.meshgrid(*(h * np.linspace(-1, 1, FOOTPRINT_POINTS) for h in half[:2]))
+    points = np.column_stack([x.ravel(), y.ravel(), sagitta(x.ravel(), probe.radius_mm) - half[2]])
+    if rounded == 0:
+        return points
+    core = np.clip(points, rounded - half, half - rounded)
+    outward = points - core
+    return core + rounded * outward / np.linalg.norm(outward, axis=1, keepdims=True)
+
+
+def depth_in(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Depth [mm] of the deepest of points (n, 3) in a closed surface, vertices (v, 3) [mm]; 0 outside.
+
+    What is inside is decided by the winding number.
+    """
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    points = points[((points > low) & (points < high)).all(axis=1)]
+    faces = np.ascontiguousarray(faces, np.int64)
+    if len(points):
+        points = points[igl.fast_winding_number(vertices, faces, points) > 0.5]
+    if not len(points):
+        return 0.0
+    return float(np.sqrt(igl.point_mesh_squared_distance(points, vertices, faces)[0].max()))
 
 
 def measure_contact(

@@ -165,6 +165,11 @@ class ManipulatorState:
     turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     aim: np.ndarray | None = None
 
+    @property
+    def presses(self) -> bool:
+        """Whether the transducer is pushed in, and not only on the surface or above it."""
+        return self.depth_mm + self.pressed_mm > 0.0
+
 
 @dataclass
 class ProbeManipulator:
@@ -267,6 +272,12 @@ class ProbeManipulator:
     def push(self, depth_mm: float) -> None:
         """Push in by a depth [mm]; lift where negative."""
         depth = float(np.clip(self.state.depth_mm + depth_mm, MIN_DEPTH_MM, self.max_mm))
+        self.state = replace(self.state, depth_mm=depth)
+
+    def go_back(self, time_s: float) -> None:
+        """Go back to the surface for a time [s], from the depth that ``push`` has set."""
+        most_mm = RELEASE_MM_S * time_s
+        depth = self.state.depth_mm - float(np.clip(self.state.depth_mm, -most_mm, most_mm))
         self.state = replace(self.state, depth_mm=depth)
 
     def press(self, pressing: bool, time_s: float, share: float = 1.0) -> None:

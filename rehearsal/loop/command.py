@@ -58,18 +58,19 @@ class _Command(BaseModel):
 
 
 class Move(_Command):
-    """One step of a length, at whose end the transducer has a pose; without a length, of the length that
-    is set.
+    """One step of a length, in which the transducer follows a hand at a pose as far as the tissue lets it;
+    without a length, of the length that is set. Unless it ``presses``, it only touches.
     """
 
     kind: Literal["move"] = "move"
     pose: Pose
     length_s: Seconds | None = None
+    presses: bool = True
 
 
 class Follow(_Command):
     """The transducer follows the hand: to the pose that the hand had at a time [s] by the clock, a time [s]
-    after the one before.
+    after the one before. Unless it ``presses``, it only touches.
 
     ``manipulator`` is the state of what the hand moves, which undo restores.
     """
@@ -78,6 +79,7 @@ class Follow(_Command):
     pose: Pose
     input_s: float = 0.0
     took_s: float = Field(0.0, ge=0)
+    presses: bool = True
     manipulator: InstanceOf[ManipulatorState] | None = None
 
 

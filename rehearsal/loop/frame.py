@@ -15,6 +15,8 @@ from ultrasound.probe_manipulator import ManipulatorState
 
 # The sinus surrounds the other parts, and would hide them.
 NOT_SHOWN = "sinus"
+# A probe that is nearer to the hand than this follows it.
+LEAST_LAG_MM = 1.0
 
 
 @dataclass(frozen=True)
@@ -36,9 +38,10 @@ class RestGeometry:
 
 @dataclass(frozen=True)
 class Step:
-    """A step that was made from the state of a number: the transducer's pose (4, 4) at its end, its length
-    [s], its iterations, the time that it took [ms], the wrench (6,) on the probe. ``notice`` is the
-    divergence check's, if it restored the state.
+    """A step that was made from the state of a number: the transducer's pose (4, 4) at its end, that of the
+    ``hand`` which it follows, its length [s], its iterations, the time that it took [ms], the wrench (6,) on
+    the probe. ``notice`` is the divergence check's, if it restored the state. Unless the transducer
+    ``presses``, it only touches.
 
     Where steps follow a clock, ``input_s`` is the time of the input that the pose shows, ``late_ms`` how much
     later than due the step began, and ``awaited`` says whether it waited for its input, because steps had to
@@ -47,11 +50,13 @@ class Step:
 
     number: int
     pose: np.ndarray
+    hand: np.ndarray
     length_s: float
     iterations: int
     took_ms: float
     wrench: np.ndarray | None = None
     notice: str = ""
+    presses: bool = True
     input_s: float = 0.0
     late_ms: float = 0.0
     awaited: bool = False
@@ -104,7 +109,8 @@ class Frame:
 
     ``number`` counts the states since the session began: each step and each command that changes the tissue
     makes another one. ``positions`` (n, 3) [mm] are those of nodes or particles, ``frames`` (k, 4, 4) those
-    of clusters where the tissue model has them. ``wrench`` (6,): force [N] on the probe, and torque [N mm]
+    of clusters where the tissue model has them. ``hand`` (4, 4) is the pose that the transducer follows, and
+    ``pose`` where the tissue lets it be. ``wrench`` (6,): force [N] on the probe, and torque [N mm]
     about the centre of the array face (LPS). ``kept`` are the numbers of the states that undo, redo and
     ``bookmarks`` may restore. ``pace`` says how steps differ from what is set.
     """
@@ -112,6 +118,7 @@ class Frame:
     number: int
     time_s: float
     pose: np.ndarray
+    hand: np.ndarray
     positions: np.ndarray
     geometry: RestGeometry
     frames: np.ndarray | None = None
@@ -127,6 +134,11 @@ class Frame:
     def carriers(self) -> np.ndarray:
         """What a ``Carrier`` of this geometry takes over."""
         return self.positions if self.frames is None else self.frames
+
+    @property
+    def lag_mm(self) -> float:
+        """How far the transducer is behind the hand."""
+        return float(np.linalg.norm(self.hand[:3, 3] - self.pose[:3, 3]))
 
     @property
     def of_session(self) -> "Frame":
@@ -174,4 +186,4 @@ def at_rest(case: Case, interpolation: Interpolation) -> Frame:
     values = interpolation.carrier().values()
     positions, frames = (values, None) if values.ndim == 2 else (np.zeros((0, 3), np.float32), values)
     geometry = whole_geometry(case, interpolation)
-    return Frame(0, 0.0, case.press_pose, positions, geometry, frames)
+    return Frame(0, 0.0, case.press_pose, case.press_pose, positions, geometry, frames)

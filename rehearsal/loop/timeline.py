@@ -88,10 +88,10 @@ class Timeline:
         """Apply a command at once. ``Follow`` is a step of the length that is set."""
         match command:
             case Move():
-                self.step(command.pose, command.length_s)
+                self.step(command.pose, command.length_s, presses=command.presses)
             case Follow():
                 self.aim(command)
-                self.step(command.pose)
+                self.step(command.pose, presses=command.presses)
             case Checkpoint():
                 self._checkpoint()
             case NewSession():
@@ -109,24 +109,25 @@ class Timeline:
 
     def step(
         self,
-        pose: np.ndarray,
+        hand: np.ndarray,
         length_s: float | None = None,
         iterations: int | None = None,
         input_s: float = 0.0,
         late_ms: float = 0.0,
         awaited: bool = False,
+        presses: bool = True,
     ) -> Step:
-        """Make a step of a length [s] with so many iterations, where given, and return it; for the others
-        see ``Step``.
+        """Make a step of a length [s] with so many iterations, where given, in which the transducer follows a
+        hand at a pose (4, 4), and return it; for the others see ``Step``.
         """
         settings = self.organ.settings
         length_s, iterations = length_s or settings.time_step_s, iterations or settings.iterations
         if iterations != self._noted_iterations:
             self._noted_iterations = iterations
             self._events.append(Applied(self.number, SetValues(values={"solver.iterations": iterations})))
-        took_ms, wrench = self.organ.timed_step(pose, length_s, iterations)
-        of_step = length_s, iterations, took_ms, wrench, self.organ.notice, input_s, late_ms, awaited
-        step = Step(self.number, pose, *of_step)
+        took_ms, wrench = self.organ.timed_step(hand, length_s, iterations, presses)
+        of_step = length_s, iterations, took_ms, wrench, self.organ.notice, presses
+        step = Step(self.number, self.organ.pose, hand, *of_step, input_s, late_ms, awaited)
         self._events.append(step)
         self._end_state(length_s)
         return step
@@ -139,6 +140,7 @@ class Timeline:
             number=self.number,
             time_s=self.time_s,
             pose=organ.pose,
+            hand=organ.hand,
             positions=array_of(organ.body.position),
             frames=carrier.values() if isinstance(carrier, ClusterCarrier) else None,
             geometry=self.geometry,
@@ -338,7 +340,7 @@ class Timeline:
             self._kept = {SETTLED: self._kept[SETTLED]}
             self._events.append(Checkpointed(0, self.whole_state(), begins=True))
             return
-        self.organ.pose = pose
+        self.organ.place(pose)
         self.organ.divergence_check.set_initial_state()
         self._kept = {SETTLED: self.whole_state()}
 

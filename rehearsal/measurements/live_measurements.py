@@ -8,7 +8,7 @@ import numpy as np
 
 from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.loop.command import Move
-from rehearsal.loop.frame import Applied, Frame, Step
+from rehearsal.loop.frame import LEAST_LAG_MM, Applied, Frame, Step
 from rehearsal.loop.timeline import periods
 from rehearsal.measurements.session_summary import SessionCourse
 from rehearsal.measurements.tumour_measurements import Measurement, measure
@@ -96,10 +96,10 @@ class LiveMeasurements:
                 if at in log.readings:
                     self.latest = _recorded_measurement(log.readings[at])
             if isinstance(command, Move):
+                pose, length_s = log.poses[number], command.length_s or log.header.time_step_s
                 if self.guide is not None:
-                    self.guide.follow(command.pose)
-                length_s = command.length_s or log.header.time_step_s
-                self.count(command.pose, length_s)
+                    self.guide.follow(pose)
+                self.count(pose, length_s)
                 time_s += length_s
             elif command.kind in RESTORES:
                 self.count(None, 0.0)
@@ -241,6 +241,8 @@ class LiveMeasurements:
         }
         if latest.force_n is not None:
             findings["force"] = self._with_band("force_n", latest.force_n, "N", 2)
+        if latest.lag_mm > LEAST_LAG_MM:
+            findings["behind hand"] = f"{_rounded(latest.lag_mm, 1)} mm"
         if latest.to_tumour_mm is None:
             if self.anatomy.scanner is not None:
                 findings["organ seen"] = self._share("organ")

@@ -6,6 +6,7 @@ import numpy as np
 
 from rehearsal.configuration import STEP, Setup
 from rehearsal.loop.frame import Frame
+from rehearsal.measurements.tumour_measurements import penetration_of
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import counted, spread
 from rehearsal.speed_accuracy import expected_error_mm, load_points
@@ -36,7 +37,9 @@ class Tally:
     finite: bool = True
     fallbacks: list[str] = field(default_factory=list)
     volume_ratio_min: float = 1.0
+    penetration_mm: float = 0.0
     max_penetration_mm: float = 0.0
+    max_lag_mm: float = 0.0
     indentation_max_mm: float = 0.0
     force_max_n: float = 0.0
 
@@ -51,8 +54,9 @@ class Tally:
         if not self.finite:
             return
         self.volume_ratio_min = min(self.volume_ratio_min, rehearsal.anatomy.volume_ratio())
-        penetration_mm = rehearsal.organ.contacts.measure_penetration()
-        self.max_penetration_mm = max(self.max_penetration_mm, penetration_mm)
+        self.penetration_mm = penetration_of(rehearsal.anatomy)
+        self.max_penetration_mm = max(self.max_penetration_mm, self.penetration_mm)
+        self.max_lag_mm = max(self.max_lag_mm, frame.lag_mm)
         self.indentation_max_mm = max(self.indentation_max_mm, rehearsal.indentation_mm())
         if frame.wrench is not None:
             self.force_max_n = max(self.force_max_n, float(np.linalg.norm(frame.wrench[:3])))
@@ -94,7 +98,9 @@ class Tally:
             numerical_error_mm=numerical_error_of(rehearsal),
             fallbacks=self.fallbacks,
             volume_ratio_min=round(self.volume_ratio_min, 6) if self.finite else None,
+            penetration_mm=round(self.penetration_mm, 6) if self.finite else None,
             max_penetration_mm=round(self.max_penetration_mm, 6) if self.finite else None,
+            max_lag_mm=round(self.max_lag_mm, 4),
             indentation_max_mm=round(self.indentation_max_mm, 4) if self.finite else None,
             force_max_n=None if wrench is None else round(self.force_max_n, 4),
             probe_force_n=None if wrench is None else [round(v, 4) for v in wrench[:3].tolist()],
@@ -140,7 +146,8 @@ def _press(report: dict) -> str:
     return (
         f"indentation {report['indentation_max_mm']:.2f} mm at most{_force(report['force_max_n'])}; "
         f"least volume {100 * report['volume_ratio_min']:.1f} %; "
-        f"penetration at most {report['max_penetration_mm']:.3f} mm; all finite"
+        f"penetration at most {report['max_penetration_mm']:.3f} mm; all finite; the probe at most "
+        f"{report['max_lag_mm']:.1f} mm behind the hand"
     )
 
 

@@ -9,7 +9,7 @@ import igl
 import numpy as np
 
 from rehearsal.deformed_anatomy import DeformedAnatomy
-from ultrasound.array_contact import face_points, measure_contact
+from ultrasound.array_contact import depth_in, face_points, footprint, measure_contact
 from ultrasound.probe import Probe
 
 
@@ -23,6 +23,10 @@ class Measurement:
     """
     contact_mm2: float
     """Area of the array face in contact."""
+    penetration_mm: float = 0.0
+    """Depth of the array face in the deformed organ, at its centre, edges and corners."""
+    lag_mm: float = 0.0
+    """How far the probe is behind the hand."""
     to_tumour_mm: float | None = None
     """Distance from the array face to the nearest point of the tumour."""
     tumour_depth_mm: float | None = None
@@ -45,7 +49,12 @@ def measure(anatomy: DeformedAnatomy, probe: Probe, touches: np.ndarray) -> Meas
     pressed = measure_contact(
         anatomy.pose, anatomy.case.size_mm, probe.radius_mm, now, np.asarray(organ.vertices), organ.faces
     )
-    always: dict[str, Any] = dict(compression_mm=pressed.compression_mm, contact_mm2=pressed.area_mm2)
+    always: dict[str, Any] = dict(
+        compression_mm=pressed.compression_mm,
+        contact_mm2=pressed.area_mm2,
+        penetration_mm=penetration_of(anatomy),
+        lag_mm=anatomy.frame.lag_mm,
+    )
     wrench = anatomy.frame.wrench
     if wrench is not None:
         always |= dict(
@@ -63,6 +72,13 @@ def measure(anatomy: DeformedAnatomy, probe: Probe, touches: np.ndarray) -> Meas
         tumour_shift_mm=float(np.linalg.norm(middle - before)),
         **_in_image(outline, probe, touches),
     )
+
+
+def penetration_of(anatomy: DeformedAnatomy) -> float:
+    """Depth [mm] of the array face in the deformed organ: of its centre, edges and corners; 0 outside."""
+    points = footprint(anatomy.case.probe)
+    places = points @ anatomy.pose[:3, :3].T + anatomy.pose[:3, 3]
+    return depth_in(places, anatomy.vertices, anatomy.organ.faces)
 
 
 def _to_tumour_mm(anatomy: DeformedAnatomy, probe: Probe, tumour: np.ndarray) -> float:

@@ -142,7 +142,7 @@ class Trial:
     def try_pass(self, parameters: np.ndarray, poses: np.ndarray) -> TriedPass:
         """Follow one pass (n, 4, 4) from close above its first pose; deterministic."""
         self.begin(TRIAL_MM_S)
-        self.rehearsal.organ.pose = advanced(poses[0], -ABOVE_MM)
+        self.rehearsal.organ.place(advanced(poses[0], -ABOVE_MM))
         self.move(self.rehearsal.organ.pose, poses[0])
         self._follow(poses)
         seen = self.coverage.seen[self.coverage.targets[self.target]][self._sampled]
@@ -199,7 +199,7 @@ class Trial:
     def _approach(self, pose: np.ndarray, way: np.ndarray | None) -> None:
         """Lower the probe to a pose, after its way from another pass, if there was one."""
         if way is None:
-            self.rehearsal.organ.pose = advanced(pose, -LIFT_MM)
+            self.rehearsal.organ.place(advanced(pose, -LIFT_MM))
         else:
             for goal in way:
                 self.move(self.rehearsal.organ.pose, goal, LIFTED_MM_S)

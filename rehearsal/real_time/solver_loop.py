@@ -102,6 +102,7 @@ class SolverLoop:
         self._connection, self._timeline, self._pace, self._memory = connection, timeline, pace, memory
         self._path = PosePath(np.eye(4))
         self._runs = False
+        self._presses = True
         # The clock's times: up to which steps were made, and at which the newest input came.
         self._simulated_s = self._input_at_s = 0.0
         # Those of the steps that are due now.
@@ -148,6 +149,7 @@ class SolverLoop:
             self._lengths_s.clear()
         self._timeline.aim(command)
         self._path.go_to(command.pose, command.input_s, command.took_s)
+        self._presses = command.presses
         self._input_at_s = perf_counter()
 
     @property
@@ -168,9 +170,9 @@ class SolverLoop:
             self._plan_steps()
         length_s, text = self._lengths_s.popleft(), pace.text(full)
         self._simulated_s += length_s
-        pose = self._path.pose_after(length_s)
+        hand = self._path.pose_after(length_s)
         clock = self._path.input_s, 1000 * late_s, pace.waits_for_input
-        step = self._timeline.step(pose, length_s, pace.iterations(full), *clock)
+        step = self._timeline.step(hand, length_s, pace.iterations(full), *clock, self._presses)
         self._send(replace(self._timeline.newest(), pace=text))
         pace.note(step.took_ms, length_s)
 

@@ -66,7 +66,7 @@ class CompressionCorrection:
 
 def approach(rehearsal: Rehearsal, pose: np.ndarray) -> None:
     """Bring the transducer to a pose from above, and wait until the tissue is at rest."""
-    rehearsal.organ.pose = advanced(pose, -APPROACH_MM)
+    rehearsal.organ.place(advanced(pose, -APPROACH_MM))
     move_to(rehearsal, pose, APPROACH_S)
     move_to(rehearsal, pose, SETTLE_S)
 

@@ -121,6 +121,19 @@ def unpack_lengths(text: str) -> np.ndarray:
     return lengths_s
 
 
+def pack_bits(bits: list[bool]) -> str:
+    """Yes or no, for each of some steps."""
+    return _packed(np.packbits(bits))
+
+
+def unpack_bits(text: str, count: int) -> np.ndarray:
+    """So many bits (n,). Raises ValueError."""
+    octets = _unpacked(text, -(-count // 8) + 1)
+    if len(octets) != -(-count // 8):
+        raise ValueError(f"bits of other than its {count} steps")
+    return np.unpackbits(np.frombuffer(octets, np.uint8), count=count).view(bool)
+
+
 def pack_seen(seen: np.ndarray) -> SeenVoxels:
     """Which voxels (nx, ny, nz) were imaged."""
     return SeenVoxels(shape=list(seen.shape), bits=_packed(np.packbits(seen)))
@@ -131,11 +144,7 @@ def unpack_seen(packed: SeenVoxels) -> np.ndarray:
     count = math.prod(packed["shape"])
     if count > MOST_VOXELS:
         raise ValueError(f"{count} voxels, expected at most {MOST_VOXELS}")
-    octets = _unpacked(packed["bits"], -(-count // 8) + 1)
-    if len(octets) != -(-count // 8):
-        raise ValueError(f"bits of other than its {count} voxels")
-    voxels = np.unpackbits(np.frombuffer(octets, np.uint8), count=count)
-    return voxels.view(bool).reshape(packed["shape"])
+    return unpack_bits(packed["bits"], count).reshape(packed["shape"])
 
 
 def _unpackable(packed: SeenVoxels) -> SeenVoxels:

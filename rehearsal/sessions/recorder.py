@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import BaseModel
 
 from rehearsal.case import Case
@@ -13,7 +14,14 @@ from rehearsal.loop.frame import Applied, Checkpointed, Digest, Frame, Step
 from rehearsal.loop.state import WholeState
 from rehearsal.notices import Notices
 from rehearsal.result_files import next_number
-from rehearsal.sessions.packed_arrays import SeenVoxels, pack_lengths, pack_poses, pack_state, pack_wrenches
+from rehearsal.sessions.packed_arrays import (
+    SeenVoxels,
+    pack_bits,
+    pack_lengths,
+    pack_poses,
+    pack_state,
+    pack_wrenches,
+)
 from rehearsal.sessions.session_file import (
     CommandLine,
     DigestLine,
@@ -103,10 +111,14 @@ class SessionRecorder:
             return
         varies = any(step.length_s != self._usual_s for step in steps)
         has_force = any(step.wrench is not None for step in steps)
+        lags = any(not np.array_equal(step.pose, step.hand) for step in steps)
+        presses = [step.presses for step in steps]
         self._write(
             MovesLine(
                 at=steps[0].number,
-                moves=pack_poses([step.pose for step in steps]),
+                moves=pack_poses([step.hand for step in steps]),
+                probe=pack_poses([step.pose for step in steps]) if lags else None,
+                presses=None if all(presses) else pack_bits(presses),
                 lengths_s=pack_lengths([step.length_s for step in steps]) if varies else None,
                 wrenches=pack_wrenches([step.wrench for step in steps]) if has_force else None,
             )

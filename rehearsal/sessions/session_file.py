@@ -32,14 +32,15 @@ from rehearsal.loop.command import (
 )
 from rehearsal.loop.state import History
 from rehearsal.loop.timeline import SETTLED
-from rehearsal.sessions.packed_arrays import Seen, SeenVoxels, unpack_lengths, unpack_poses
+from rehearsal.sessions.packed_arrays import Seen, SeenVoxels, unpack_bits, unpack_lengths, unpack_poses
 from scenes.scene import Scene
 from text_files import TextError, json_value
 
 # Times are sums of steps.
 ROUNDING_S = 1e-9
-# The format of a session's file. The first had events between the poses of seconds.
-SESSION_FORMAT = 3
+# The format of a session's file. The first had events between the poses of seconds; in the third the probe
+# was where the hand asked for it.
+SESSION_FORMAT = 4
 MOST_FILE_BYTES = 2_000_000_000
 # The parts of a scene that belong to the patient's folder and may name files.
 PATIENTS: dict[str, Any] = {
@@ -95,12 +96,15 @@ class CommandLine(_Line):
 
 
 class MovesLine(_Line):
-    """Moves from the state of a number on, packed: poses, lengths where one is not the header's, and wrenches
-    (force [N] of the tissue on the probe, torque [N mm] about the centre of the array face, LPS).
+    """Moves from the state of a number on, packed: the poses that the hand asked for, those of the probe
+    where one differs, which moves pressed where one only touched, lengths where one is not the header's, and
+    wrenches (force [N] of the tissue on the probe, torque [N mm] about the centre of the array face, LPS).
     """
 
     at: int = Field(ge=0)
     moves: str
+    probe: str | None = None
+    presses: str | None = None
     lengths_s: str | None = None
     wrenches: str | None = None
 
@@ -147,11 +151,12 @@ LINES: dict[str, type[_Line]] = dict(
 @dataclass
 class Log:
     """A session as read: its ``commands`` in their order, each with the number of the state that it was
-    applied to; the rest by number.
+    applied to; the rest by number. ``poses`` (4, 4) are those of the probe after a move.
     """
 
     header: Header
     commands: list[tuple[int, Recorded | Move]] = field(default_factory=list)
+    poses: dict[int, np.ndarray] = field(default_factory=dict)
     digests: dict[int, str] = field(default_factory=dict)
     states: dict[int, str] = field(default_factory=dict)
     seen: dict[int, SeenVoxels] = field(default_factory=dict)
@@ -279,18 +284,22 @@ def _add(log: Log, line: _Line, number: int) -> int:
 
 
 def _add_moves(log: Log, line: MovesLine, number: int) -> int:
-    poses = unpack_poses(line.moves)
-    if not are_rigid(poses) or len(poses) == 0:
+    hand = unpack_poses(line.moves)
+    count = len(hand)
+    probe = hand if line.probe is None else unpack_poses(line.probe)
+    if not are_rigid(np.concatenate([hand, probe])) or count == 0:
         raise ValueError("has a pose that is none of a probe: expected right-angled axes of length 1")
-    lengths_s = np.full(len(poses), log.header.time_step_s)
+    lengths_s = np.full(count, log.header.time_step_s)
     if line.lengths_s is not None:
         lengths_s = unpack_lengths(line.lengths_s)
-    if len(lengths_s) != len(poses):
-        raise ValueError(f"has {len(lengths_s)} lengths of {len(poses)} moves")
-    for count, (pose, length_s) in enumerate(zip(poses, lengths_s.tolist(), strict=True)):
-        move = Move.model_construct(kind="move", pose=pose, length_s=length_s)
-        log.commands.append((number + count, move))
-    return number + len(poses)
+    presses = np.ones(count, bool) if line.presses is None else unpack_bits(line.presses, count)
+    if len(lengths_s) != count or len(probe) != count:
+        raise ValueError(f"has {len(lengths_s)} lengths and {len(probe)} poses of the probe of {count} moves")
+    for at, (pose, length_s) in enumerate(zip(hand, lengths_s.tolist(), strict=True), number):
+        of_move = dict(pose=pose, length_s=length_s, presses=bool(presses[at - number]))
+        log.commands.append((at, Move.model_construct(kind="move", **of_move)))
+        log.poses[at] = probe[at - number]
+    return number + count
 
 
 def _check_follows(at: int, number: int) -> None:

@@ -38,6 +38,8 @@ from ultrasound.probe_manipulator import ManipulatorState, ProbeManipulator
 
 # A transducer that moves by no more than this between two frames is at rest [mm].
 STILL_MM = 1e-3
+# The mouse has moved on from where keys pushed the transducer in when it aims further away than this.
+MOVED_ON_MM = 3.0
 # Input that follows the last one sooner than this belongs to the same action; an action lasts no longer than
 # that.
 PAUSE_S, LONGEST_S = 0.5, 5.0
@@ -115,6 +117,7 @@ class UserSource:
             pose=pose,
             input_s=perf_counter(),
             took_s=elapsed_s,
+            presses=not self.is_manual or self.hand.manipulator.state.presses,
             manipulator=self.hand.manipulator.state,
         )
 
@@ -255,10 +258,12 @@ class Hand:
         self.manipulator, self.waits = manipulator, waits
         self._ray: Ray | None = None
         self._ray_at_slide: Ray | None = None
+        self._pushed_at_mm: np.ndarray | None = None
 
     def wait(self, ray: Ray | None) -> None:
         """Stay until the mouse leaves a ray, or a key is pressed."""
         self.waits, self._ray = True, ray
+        self._pushed_at_mm = self.manipulator.aim[:3, 3]
 
     def pose(self, controls: Controls, pose: np.ndarray, time_s: float) -> np.ndarray:
         """The transducer's next pose (4, 4) after the last one, a time [s] later."""
@@ -275,9 +280,19 @@ class Hand:
             manipulator.point(*controls.ray)
             self._ray_at_slide = None
         manipulator.press(controls.press, time_s, controls.press_share)
-        manipulator.push(controls.push_mm)
+        self._push(controls, time_s)
         manipulator.turn(controls.tilt_deg, controls.rock_deg, controls.rotate_deg)
         return manipulator.pose_towards(manipulator.pose(), pose, time_s)
+
+    def _push(self, controls: Controls, time_s: float) -> None:
+        """Push by the keys; the depth goes back when the mouse has moved on."""
+        manipulator = self.manipulator
+        aim_mm = manipulator.aim[:3, 3]
+        if controls.push_mm or any(controls.slide_mm):
+            self._pushed_at_mm = aim_mm
+            manipulator.push(controls.push_mm)
+        elif (at_mm := self._pushed_at_mm) is not None and np.linalg.norm(aim_mm - at_mm) > MOVED_ON_MM:
+            manipulator.go_back(time_s)
 
 
 def acts(controls: Controls, ray: Ray | None) -> bool:

@@ -137,9 +137,9 @@ def _press(rehearsal: Rehearsal, values: dict[str, float]) -> np.ndarray:
     press, touches = case.press, all_scanlines(case.probe)
     organ.solver.restart()
     organ.divergence_check.set_initial_state()
-    organ.pose = rehearsal.pose_at_depth(-200.0)
+    organ.place(rehearsal.pose_at_depth(-200.0))
     organ.come_to_rest()
-    organ.pose = rehearsal.pose_at_depth(0.0)
+    organ.place(rehearsal.pose_at_depth(0.0))
     step_s = organ.settings.time_step_s
     outcomes = []
     for stage in range(len(press.indentations_mm)):

@@ -53,7 +53,7 @@ def guided(anatomy) -> LiveMeasurements:
 def observed(measurements: LiveMeasurements, *poses: np.ndarray) -> None:
     """A frame of a step to each pose, so long that each is measured."""
     for number, pose in enumerate(poses):
-        step = Step(number, pose, MEASURE_S, 4, 1.0)
+        step = Step(number, pose, pose, MEASURE_S, 4, 1.0)
         measurements.observe(frame_at(pose, number + 1, (number + 1) * MEASURE_S, step), PROBE)
 
 

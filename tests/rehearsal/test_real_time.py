@@ -253,7 +253,7 @@ class ClockedLoop(SolverLoop):
         self.begun.append((self.now_s, round(60 * length_s), pose[0, 3]))
         self.now_s += 0.01 + self.hangs_s
         self.hangs_s = 0.0
-        return Step(0, pose, length_s, iterations, 10.0)
+        return Step(0, pose, pose, length_s, iterations, 10.0)
 
     def aim(self, command: Follow) -> None: ...
     def newest(self) -> Frame:
@@ -325,7 +325,7 @@ class ScriptedPipe:
 def collected_at(monkeypatch, steps: list[tuple[float, float, bool]], inputs_s: list[float]) -> list[float]:
     """When the frame of each input was there; steps are (made at, of the input at, awaited) [s]."""
     made = [
-        (at_s, Step(0, np.eye(4), 1 / 15, 4, 10.0, input_s=of_s, awaited=awaited))
+        (at_s, Step(0, np.eye(4), np.eye(4), 1 / 15, 4, 10.0, input_s=of_s, awaited=awaited))
         for at_s, of_s, awaited in steps
     ]
     solver = SolverProcess(start_process())

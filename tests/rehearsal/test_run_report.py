@@ -44,7 +44,7 @@ def frame_of(wrench: np.ndarray, *events: Event, last_mm: float = 0.0) -> Frame:
     return replace(frame_at(np.eye(4), 1, 0.0, *events), positions=positions, wrench=wrench)
 
 
-STEP = Step(0, np.eye(4), 0.01, 4, 1.0)
+STEP = Step(0, np.eye(4), np.eye(4), 0.01, 4, 1.0)
 
 
 @pytest.mark.parametrize("lost", [None, np.nan, np.inf])

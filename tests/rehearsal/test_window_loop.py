@@ -297,7 +297,7 @@ def test_a_restored_state_is_a_notice_and_stands_in_the_panel_for_a_while(loopin
 
 def test_a_pace_that_differs_is_said_once(tmp_path, capsys):
     announcements = Announcements(None, Notices())
-    step = Step(0, np.eye(4), STEP_S, 4, 1.0)
+    step = Step(0, np.eye(4), np.eye(4), STEP_S, 4, 1.0)
     frame = replace(fake_timeline().newest(), events=(step,))
     for pace in ("", "LONGER STEPS   1/30 s", "LONGER STEPS   1/15 s", ""):
         announcements.observe(replace(frame, pace=pace), None)

@@ -79,7 +79,7 @@ def led(hand: ScriptedHand, clock: list[float], most: int = 1000) -> list[Contro
 
 
 def step_of(length_s: float, late_ms: float = 0.0) -> Step:
-    return Step(0, np.eye(4), length_s, 4, took_ms=9.0, late_ms=late_ms)
+    return Step(0, np.eye(4), np.eye(4), length_s, 4, took_ms=9.0, late_ms=late_ms)
 
 
 def test_the_hand_presses_and_drags_over_the_organ(hand, clock):
