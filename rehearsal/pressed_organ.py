@@ -60,13 +60,16 @@ class OrganState:
 class PressedOrgan:
     """The solver of a case's organ under its probe.
 
-    Taichi must be initialised, and initialised again for another case, which frees this one. ``on_wrench`` is
+    ``pose`` (4, 4) is the transducer's, ``hand`` that which it follows. Taichi must be initialised, and
+    initialised again for another case, which frees this one. ``on_wrench`` is
     called after each ``timed_step`` with the transducer's pose (4, 4) and the ``wrench``, at the rate of the
     steps: for a haptic device. ``serial`` says whether a step is computed on one core; left open, the body's
     size and the machine decide.
     """
 
     on_wrench: Callable[[np.ndarray, np.ndarray], None] | None = None
+    pose: np.ndarray
+    hand: np.ndarray
 
     def __init__(self, case: Case, serial: bool | None = None) -> None:
         self.case = case

@@ -27,9 +27,9 @@ MOST_CONTACT_PATH_MM = 10.0
 PROJECTIONS = 8
 # What may be left of a penetration after that, and how much further than needed the tool retreats.
 TOLERANCE_MM, ROUNDING_MM = 0.005, 1e-3
-# A tool whose face meets the tissue retreats along its axis, as it is held; where the surface's normal is
-# further from the axis than 60 degrees, along the normal.
-LEAST_ALONG_AXIS = 0.5
+# A tool retreats along its axis, as it is held, where that takes no more than this; else along the normal of
+# its nearest side.
+MOST_AXIAL_MM = 2.0
 
 
 class Proxy:
@@ -72,7 +72,7 @@ class Proxy:
             count = self.gather_near(length)
             reached, share, retreat, clearance = tm.vec4(0.0), 0.0, tm.vec3(0.0), 0.0
             # Where the tissue itself has moved into the tool, this gets no worse at least.
-            least = ti.min(-TOLERANCE_MM, self.deepest(self.start[None], retreat, count).w + most_mm)
+            least = ti.min(-TOLERANCE_MM, self.deepest(self.start[None], retreat, count)[0].w + most_mm)
             for _increment in range(MOST_INCREMENTS):
                 is_free = retreat.norm_sqr() == 0.0 or share * length < MOST_CONTACT_PATH_MM
                 if share < 1.0 and clearance >= least and is_free:
@@ -115,31 +115,37 @@ class Proxy:
         clearance = -FAR
         for projection in range(PROJECTIONS + 1):
             if clearance < 0.0:
-                deepest = self.deepest(pose, retreat, count)
-                clearance = deepest.w + most_mm
+                nearest, local = self.deepest(pose, retreat, count)
+                clearance = nearest.w + most_mm
                 if clearance < 0.0 and projection < PROJECTIONS:
-                    normal, axis, by = deepest.xyz, pose[:3, 2], ROUNDING_MM - clearance
-                    along = -normal.dot(axis)
-                    retreat += by / along * axis if along > LEAST_ALONG_AXIS else -by * normal
+                    axial = self.tool.depth_along_axis(local) - most_mm
+                    if axial < MOST_AXIAL_MM:
+                        retreat += (ti.max(axial, 0.0) + ROUNDING_MM) * pose[:3, 2]
+                    else:
+                        retreat += (clearance - ROUNDING_MM) * (pose[:3, :3] @ nearest.xyz)
         return tm.vec4(retreat, clearance)
 
     @ti.func
     def deepest(self, pose, retreat, count):
-        """Outward normal of the tool and signed distance [mm] from it, at the point that is deepest in it."""
+        """The point that is deepest in the tool: the tool's outward normal and signed distance [mm] there,
+        and its place, in the tool's own frame.
+        """
         rotation, middle = pose[:3, :3], pose[:3, 3] + retreat
-        deepest = tm.vec4(0.0, 0.0, 0.0, FAR)
+        nearest, place = tm.vec4(0.0, 0.0, 0.0, FAR), tm.vec3(0.0)
         for k in range(count):
             point = self.contacts.surface_ball(self.near[k])
             offset = point.xyz - middle
             bound = offset.norm() - self.tool.ball_mm - point.w
-            if bound < deepest.w:
+            if bound < nearest.w:
                 if bound > INCREMENT_MM:
-                    deepest.w = bound
+                    nearest.w = bound
                 else:
-                    surface = self.tool.surface_from(rotation.transpose() @ offset)
-                    if surface.w - point.w < deepest.w:
-                        deepest = tm.vec4(rotation @ surface.xyz, surface.w - point.w)
-        return deepest
+                    local = rotation.transpose() @ offset
+                    surface = self.tool.surface_from(local)
+                    if surface.w - point.w < nearest.w:
+                        nearest, place = tm.vec4(surface.xyz, surface.w - point.w), local
+                        place.z += point.w
+        return nearest, place
 
 
 @ti.func

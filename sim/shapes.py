@@ -245,6 +245,16 @@ class ConvexTool:
         return tm.vec4(normal, depth - self.edge_radius)
 
     @ti.func
+    def depth_along_axis(self, local):
+        """How far [mm] the tool must move along its z axis until a point in it is outside; local to it."""
+        depth = FAR
+        for k in range(self.count):
+            plane = self.half_space[k]
+            if plane.z < -1e-3:
+                depth = ti.min(depth, (plane.w + self.edge_radius - plane.xyz.dot(local)) / -plane.z)
+        return depth
+
+    @ti.func
     def entered(self, start, p, least_mm: float):
         """The half-space by which a point that has moved from a start to p has entered the tool, while that
         moved too: outward normal, and offset of normal . x = offset [mm]; zero where it was not deeper in it
