@@ -160,10 +160,12 @@ class SurfaceContacts:
             for s in ti.static(range(len(self.shapes))):
                 query = self.last_query[s, q]
                 if ti.static(self.shapes[s].moves) or not is_known(query, p):
-                    surface = self.shapes[s].surface(p)
-                    query = tm.vec4(p, ti.min(surface.w, REACH_MM))
+                    query = tm.vec4(p, REACH_MM)
+                    if not self.shapes[s].is_beyond(p, NEAR_MM):
+                        surface = self.shapes[s].surface(p)
+                        query.w = ti.min(surface.w, REACH_MM)
+                        self.plane[s, q] = tm.vec4(surface.xyz, surface.xyz.dot(p) - surface.w)
                     self.last_query[s, q] = query
-                    self.plane[s, q] = tm.vec4(surface.xyz, surface.xyz.dot(p) - surface.w)
                 if query.w - (p - query.xyz).norm() < NEAR_MM:
                     near |= 1 << s
             self.near[q] = near
