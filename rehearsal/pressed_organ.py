@@ -33,7 +33,7 @@ from sim.removed_tissue import RemovedTissue
 from sim.shapes import Plane, SignedDistanceField
 from sim.solver import SolverState
 from sim.stored_arrays import stored
-from sim.surface_contact import SurfaceContacts
+from sim.surface_contact import ContactLoad, SurfaceContacts
 from sim.viscoelasticity import Relaxation
 from ultrasound.probe_manipulator import advanced, array_face_centre, poses_between
 
@@ -246,9 +246,16 @@ class PressedOrgan:
         centre of the array face, along the patient's axes (LPS); None for a tissue model whose contacts have
         no forces.
         """
+        load = self.load()
+        return None if load is None else load.wrench
+
+    def load(self) -> ContactLoad | None:
+        """The load on the probe after the last step: its ``wrench``, as above, and how much of the contact
+        slides; None for a tissue model whose contacts have no forces.
+        """
         if not isinstance(self.contacts, SurfaceContacts):
             return None
-        return self.contacts.wrench(self.tool, array_face_centre(self.pose, self.case.size_mm[2]))
+        return self.contacts.load(self.tool, array_face_centre(self.pose, self.case.size_mm[2]))
 
     def place(self, pose: np.ndarray) -> None:
         """Have the transducer at a pose (4, 4) at once, where no tissue is."""

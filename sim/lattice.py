@@ -349,6 +349,8 @@ def _sides(normal: np.ndarray) -> np.ndarray:
 def surface_points(surface: trimesh.Trimesh, spacing_mm: float) -> tuple[np.ndarray, np.ndarray]:
     """Points (k, 3) [mm] on a surface, about a spacing apart, and the area (k,) [mm^2] of each."""
     middle, area, normal = _small_faces(surface, spacing_mm / 2)
+    # The grid of the cells begins half a cell beside the same corner: with two points a cell, all cells have
+    # them at the same places, without which the forces of contacts vary twice as much (docs/accuracy.md).
     bins = np.floor((middle - surface.bounds[0]) / spacing_mm).astype(int)
     # Points are separate for faces of different direction: only what faces a support is in contact with it.
     keys, owner = _unique_rows(np.column_stack([bins, _sides(normal)]))

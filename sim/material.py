@@ -28,6 +28,11 @@ class Material:
         return 2 * self.mu * self.poisson / (1 - 2 * self.poisson)
 
     @property
+    def bulk(self) -> float:
+        """Bulk modulus [g/(mm s^2)]."""
+        return self.lambda_ + 2 / 3 * self.mu
+
+    @property
     def density(self) -> float:
         """Density [g/mm^3]."""
         return 1e-3 * self.density_g_cm3
@@ -48,13 +53,18 @@ def mixture(
     """mu, lambda [g/(mm s^2)] and density [g/mm^3], (m,) each, of elements with volume shares (m, parts) of
     the parts.
 
-    Voigt's rule: the means by volume. An element has one deformation gradient, so that this is its energy
-    integrated over the parts, as in the finite cell method; docs/method.md compares it with Reuss's rule and
-    others.
+    The density is the mean by volume, shear and bulk modulus are Hill's means; docs/method.md compares them
+    with other rules.
     """
     materials = (outside, *parts)
     shares = np.column_stack([1 - share.sum(axis=1), share])
-    mu, lambda_, density = (
-        shares @ [getattr(material, name) for material in materials] for name in ("mu", "lambda_", "density")
-    )
-    return mu, lambda_, density
+    mu = _hill_mean(shares, np.array([material.mu for material in materials]))
+    bulk = _hill_mean(shares, np.array([material.bulk for material in materials]))
+    return mu, bulk - 2 / 3 * mu, shares @ [material.density for material in materials]
+
+
+def _hill_mean(shares: np.ndarray, moduli: np.ndarray) -> np.ndarray:
+    """Effective modulus (m,) of moduli (k,) by their volume shares (m, k): the mean of the bounds of Voigt,
+    one strain in all parts, and Reuss, one stress (Hill 1952).
+    """
+    return (shares @ moduli + 1 / (shares @ (1 / moduli))) / 2

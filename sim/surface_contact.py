@@ -7,6 +7,8 @@ stiffness, and friction with elastic tangential slip, limited by the coefficient
 2006, ch. 5 and 10).
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import taichi as ti
 import taichi.math as tm
@@ -35,6 +37,25 @@ DEEP_MM = 0.5
 BLOCK = 64
 # Distance around a static shape within which the distance to it must be known [mm].
 REACH_MM = 6.0
+# A point slides where its friction is at least this share of Coulomb's limit, known up to rounding.
+SLIDING = 0.999
+# A shape slips where more than this share of its contact slides.
+SLIPS = 0.5
+
+
+@dataclass(frozen=True)
+class ContactLoad:
+    """What a shape bears of the tissue in the last step.
+
+    ``wrench`` (6,): force [N] on the shape, and its torque [N mm] about a point. ``sliding_share``: share of
+    the contact that slides, by its normal force, 0 to 1. ``friction_ratio``: tangential over normal force,
+    both summed over the contact points; the coefficient where all of them slide. Both are 0 without contact,
+    and without friction.
+    """
+
+    wrench: np.ndarray
+    sliding_share: float
+    friction_ratio: float
 
 
 class SurfaceContacts:
@@ -79,7 +100,8 @@ class SurfaceContacts:
         self.stiffness = 0.0
         self.penetration = zeros()
         self.blocks = -(-self.count // BLOCK)
-        self.block_wrench = zeros(self.blocks, 6, within=1)
+        # Of each block: force [uN], torque [uN mm], and the normal, tangential and sliding normal force [uN].
+        self.block_load = zeros(self.blocks, 9, within=1)
         self.reset()
 
     def _interpolation(self, lattice: Lattice, points: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -307,31 +329,40 @@ class SurfaceContacts:
                         slip, _ = self.tangential_slip(s, q, depth)
                     self.slip[s, q] = slip
 
-    def wrench(self, shape: object, about: np.ndarray) -> np.ndarray:
-        """Force [N] of the tissue on a shape, and its torque [N mm] about a point (3,) [mm]: (6,), in the
-        last step.
+    def load(self, shape: object, about: np.ndarray) -> ContactLoad:
+        """The load of the tissue on a shape in the last step, with the torque about a point (3,) [mm].
 
-        These are the forces that balance those in the tissue, friction included.
+        Its forces balance those in the tissue, friction included.
         """
         self._sum_forces(self.shapes.index(shape), *about.tolist())
-        return -1e-6 * array_of(self.block_wrench).sum(axis=0, dtype=np.float64)
+        total = 1e-6 * array_of(self.block_load).sum(axis=0, dtype=np.float64)
+        normal, tangential, sliding = total[6:].tolist()
+        if normal == 0.0:
+            return ContactLoad(-total[:6], 0.0, 0.0)
+        return ContactLoad(-total[:6], sliding / normal, tangential / normal)
 
     @kernel
     def _sum_forces(self, s: ti.template(), x: float, y: float, z: float):
-        """Force [uN] of shape s on the points of each block, and its torque [uN mm]."""
+        """The forces of shape s on the points of each block, as in ``block_load``."""
         for block in range(self.blocks):
-            force, torque = tm.vec3(0.0), tm.vec3(0.0)
+            force, torque, sizes = tm.vec3(0.0), tm.vec3(0.0), tm.vec3(0.0)
             for q in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.count)):
                 depth = self.depth(s, q)
                 if depth > 0.0:
+                    penalty = 1e3 * self.stiffness * self.area[q]
                     pressure = depth * self.plane[s, q].xyz
+                    friction = 0.0
                     if ti.static(self.has_friction):
                         pressure -= TANGENTIAL_RATIO * self.slip[s, q]
-                    at_point = 1e3 * self.stiffness * self.area[q] * pressure
+                        friction = TANGENTIAL_RATIO * self.slip[s, q].norm()
+                    slides = friction > SLIDING * self.coefficient * depth
+                    at_point = penalty * pressure
                     force += at_point
                     torque += (self.point[q] - tm.vec3(x, y, z)).cross(at_point)
+                    sizes += penalty * tm.vec3(depth, friction, depth if slides else 0.0)
             for k in ti.static(range(3)):
-                self.block_wrench[block][k], self.block_wrench[block][k + 3] = force[k], torque[k]
+                self.block_load[block][k], self.block_load[block][k + 3] = force[k], torque[k]
+                self.block_load[block][k + 6] = sizes[k]
 
     @kernel
     def measure_penetration(self) -> float:

@@ -14,6 +14,7 @@ from scenes.tissue import TissueSection
 from sim.body import BodyState
 from sim.divergence_check import DivergenceState
 from sim.solver import SolverState, StepSettings
+from sim.surface_contact import ContactLoad
 
 STEP_S = 0.125
 PHANTOM = Scene(anatomy=AnatomyFiles(phantom=True), solver=SolverSection(iterations=4))
@@ -65,7 +66,10 @@ class FakeOrgan:
         return 1.0, self.wrench()
 
     def wrench(self) -> np.ndarray:
-        return np.full(6, self.position.sum(), np.float32)
+        return self.load().wrench
+
+    def load(self) -> ContactLoad:
+        return ContactLoad(np.full(6, self.position.sum(), np.float32), 0.25, 0.125)
 
     def digest(self) -> str:
         arrays = self.position, self.velocity

@@ -111,7 +111,8 @@ class Frame:
     makes another one. ``positions`` (n, 3) [mm] are those of nodes or particles, ``frames`` (k, 4, 4) those
     of clusters where the tissue model has them. ``hand`` (4, 4) is the pose that the transducer follows, and
     ``pose`` where the tissue lets it be. ``wrench`` (6,): force [N] on the probe, and torque [N mm]
-    about the centre of the array face (LPS). ``kept`` are the numbers of the states that undo, redo and
+    about the centre of the array face (LPS); ``sliding_share`` and ``friction_ratio`` are those of
+    ``sim.surface_contact.ContactLoad``. ``kept`` are the numbers of the states that undo, redo and
     ``bookmarks`` may restore. ``pace`` says how steps differ from what is set.
     """
 
@@ -123,6 +124,8 @@ class Frame:
     geometry: RestGeometry
     frames: np.ndarray | None = None
     wrench: np.ndarray | None = None
+    sliding_share: float | None = None
+    friction_ratio: float | None = None
     resection: Resection = NO_RESECTION
     manipulator: ManipulatorState | None = None
     kept: frozenset[int] = frozenset()

@@ -136,6 +136,7 @@ class Timeline:
         """The present state, with the events since the last call."""
         events, self._events = tuple(self._events), []
         organ, carrier = self.organ, self.organ.model.carrier
+        load = organ.load()
         return Frame(
             number=self.number,
             time_s=self.time_s,
@@ -144,7 +145,9 @@ class Timeline:
             positions=array_of(organ.body.position),
             frames=carrier.values() if isinstance(carrier, ClusterCarrier) else None,
             geometry=self.geometry,
-            wrench=organ.wrench(),
+            wrench=None if load is None else load.wrench,
+            sliding_share=None if load is None else load.sliding_share,
+            friction_ratio=None if load is None else load.friction_ratio,
             resection=self.resection,
             manipulator=self._manipulator,
             kept=frozenset(self._kept),

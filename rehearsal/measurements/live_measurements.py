@@ -18,6 +18,7 @@ from rehearsal.resection.judgement import findings_of
 from rehearsal.sessions.packed_arrays import unpack_seen
 from rehearsal.sessions.session_file import Log, SessionError, makes_state
 from render.viewer import View, ViewSettings
+from sim.surface_contact import SLIPS
 from ultrasound.coverage import GRID_POINTS, Coverage, Gap
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import ProbeManipulator
@@ -243,6 +244,8 @@ class LiveMeasurements:
             findings["force"] = self._with_band("force_n", latest.force_n, "N", 2)
         if latest.lag_mm > LEAST_LAG_MM:
             findings["behind hand"] = f"{_rounded(latest.lag_mm, 1)} mm"
+        if latest.sliding_share is not None and latest.sliding_share > SLIPS:
+            findings["slip"] = f"{100 * latest.sliding_share:.0f} % of contact"
         if latest.to_tumour_mm is None:
             if self.anatomy.scanner is not None:
                 findings["organ seen"] = self._share("organ")

@@ -11,6 +11,7 @@ from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import counted, spread
 from rehearsal.speed_accuracy import expected_error_mm, load_points
 from scenes.tissue import TISSUES
+from sim.surface_contact import SLIPS
 from version import VERSION
 
 # Keys that some tissue models leave open.
@@ -66,7 +67,8 @@ class Tally:
         that is not finite.
         """
         case, settings = rehearsal.case, rehearsal.organ.settings
-        wrench = rehearsal.frame.wrench if self.finite else None
+        frame = rehearsal.frame
+        wrench = frame.wrench if self.finite else None
         return dict(
             version=VERSION,
             title=case.scene.title,
@@ -105,7 +107,13 @@ class Tally:
             force_max_n=None if wrench is None else round(self.force_max_n, 4),
             probe_force_n=None if wrench is None else [round(v, 4) for v in wrench[:3].tolist()],
             probe_torque_n_mm=None if wrench is None else [round(v, 3) for v in wrench[3:].tolist()],
+            sliding_share=_rounded(frame.sliding_share if self.finite else None),
+            friction_ratio=_rounded(frame.friction_ratio if self.finite else None),
         )
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 4)
 
 
 def _times(ms: list[float]) -> dict[str, float] | None:
@@ -144,7 +152,8 @@ def _press(report: dict) -> str:
     if not report["finite"]:
         return "NOT FINITE: the tissue diverged, and there are no figures of it"
     return (
-        f"indentation {report['indentation_max_mm']:.2f} mm at most{_force(report['force_max_n'])}; "
+        f"indentation {report['indentation_max_mm']:.2f} mm at most{_force(report['force_max_n'])}"
+        f"{_slip(report['sliding_share'])}; "
         f"least volume {100 * report['volume_ratio_min']:.1f} %; "
         f"penetration at most {report['max_penetration_mm']:.3f} mm; all finite; the probe at most "
         f"{report['max_lag_mm']:.1f} mm behind the hand"
@@ -153,6 +162,12 @@ def _press(report: dict) -> str:
 
 def _force(most_n: float | None) -> str:
     return "" if most_n is None else f", force {most_n:.2f} N at most"
+
+
+def _slip(share: float | None) -> str:
+    if share is None or share <= SLIPS:
+        return ""
+    return f", {100 * share:.0f} % of the contact slides"
 
 
 def _error(expected_mm: float | None) -> str:

@@ -41,6 +41,10 @@ class Measurement:
     """Force [N] of the tissue on the probe."""
     torque_n_mm: float | None = None
     """Torque [N mm] of that force about the centre of the array face."""
+    sliding_share: float | None = None
+    """Share of the contact with the probe that slides, by its normal force, 0 to 1."""
+    friction_ratio: float | None = None
+    """Tangential over normal force on the probe, summed over the contact points."""
 
 
 def measure(anatomy: DeformedAnatomy, probe: Probe, touches: np.ndarray) -> Measurement:
@@ -58,7 +62,10 @@ def measure(anatomy: DeformedAnatomy, probe: Probe, touches: np.ndarray) -> Meas
     wrench = anatomy.frame.wrench
     if wrench is not None:
         always |= dict(
-            force_n=float(np.linalg.norm(wrench[:3])), torque_n_mm=float(np.linalg.norm(wrench[3:]))
+            force_n=float(np.linalg.norm(wrench[:3])),
+            torque_n_mm=float(np.linalg.norm(wrench[3:])),
+            sliding_share=anatomy.frame.sliding_share,
+            friction_ratio=anatomy.frame.friction_ratio,
         )
     outline = anatomy.tumour_outline()
     if outline is None or anatomy.tumour is None:

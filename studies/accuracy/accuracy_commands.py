@@ -86,7 +86,7 @@ def validate(options: ValidateOptions) -> None:
     click.echo(f"{summary(figures, experiment.describe(setup))}\nbuilt  in {built_s:.1f} s, on {used}\n")
     click.echo(table(loaded, run.beads))
     if np.isfinite(run.force_n).all():
-        click.echo(f"\n{force_table(loaded, run.force_n)}")
+        click.echo(f"\n{force_table(loaded, run)}")
     try:
         if options.check:
             figures["independence"] = []

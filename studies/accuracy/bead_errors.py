@@ -6,6 +6,7 @@ import numpy as np
 
 from rehearsal.configuration import Setup
 from rehearsal.result_files import counted, rounded, spread
+from sim.surface_contact import SLIPS
 from studies.accuracy.bead_case import BeadCase
 from studies.accuracy.bead_experiment import BeadExperiment, BeadRun
 from studies.harness import step_of
@@ -26,12 +27,15 @@ COLUMNS = {
     "ratio": "{ratio:.2f}",
     "r(distance)": "{related:.2f}",
 }
+SLIP = "Most of the contact slides at stage {}: beads and force from there on depend on the grid."
 FORCE_COLUMNS = {
     "stage": "{stage}",
     "force on the probe x, y, z, N": "{simulated}",
     "measured": "{measured}",
     "difference, N": "{apart:.3f}",
     "%": "{percent:.1f}",
+    "contact sliding, %": "{sliding:.0f}",
+    "tangential / normal": "{friction_ratio:.2f}",
 }
 
 
@@ -75,15 +79,24 @@ def stage_figures(
 
 def force_figures(case: BeadCase, run: BeadRun) -> list[dict[str, Any]]:
     """Each stage's force of the tissue on the probe, simulated and measured, x, y, z [N], None where unknown;
-    and the centroids of the parts [mm].
+    how much of the contact slides; and the centroids of the parts [mm].
     """
     return [
         dict(
             probe_force_N=_vector(simulated),
             measured_probe_force_N=_vector(measured),
+            sliding_share=rounded(sliding),
+            friction_ratio=rounded(ratio),
             part_centroids_mm=[_vector(part) for part in parts],
         )
-        for simulated, measured, parts in zip(run.force_n, case.probe_force_n, run.parts_mm, strict=True)
+        for simulated, measured, sliding, ratio, parts in zip(
+            run.force_n,
+            case.probe_force_n,
+            run.sliding_share,
+            run.friction_ratio,
+            run.parts_mm,
+            strict=True,
+        )
     ]
 
 
@@ -159,10 +172,10 @@ def table(case: BeadCase, beads: np.ndarray) -> str:
     return "\n".join([table_of(COLUMNS, rows), "", title, *bands])
 
 
-def force_table(case: BeadCase, force_n: np.ndarray) -> str:
-    """The tissue's force on the probe (stages, 3) [N] beside the measured one."""
-    rows = []
-    for stage, (simulated, measured) in enumerate(zip(force_n, case.probe_force_n, strict=True)):
+def force_table(case: BeadCase, run: BeadRun) -> str:
+    """The tissue's force on the probe at each stage beside the measured one, and where the probe slips."""
+    rows: list[dict[str, Any]] = []
+    for stage, (simulated, measured) in enumerate(zip(run.force_n, case.probe_force_n, strict=True)):
         apart, size = np.linalg.norm(simulated - measured), np.linalg.norm(measured)
         rows.append(
             dict(
@@ -171,9 +184,12 @@ def force_table(case: BeadCase, force_n: np.ndarray) -> str:
                 measured=_in_words(measured),
                 apart=None if np.isnan(apart) else apart,
                 percent=100 * apart / size if size > LEAST_FORCE_N else None,
+                sliding=100 * run.sliding_share[stage],
+                friction_ratio=run.friction_ratio[stage],
             )
         )
-    return table_of(FORCE_COLUMNS, rows)
+    slips = [str(stage) for stage in np.flatnonzero(run.sliding_share > SLIPS)]
+    return "\n".join([table_of(FORCE_COLUMNS, rows), *([SLIP.format(", ".join(slips))] if slips else [])])
 
 
 def _in_words(force_n: np.ndarray) -> str:

@@ -32,9 +32,10 @@ AWAY_MM = 60.0
 @dataclass
 class BeadRun:
     """One run: ``beads`` (stages, n, 3) [mm] at the end of each stage, and ``arriving`` when the probe has
-    just arrived; the tissue's force on the probe ``force_n`` (stages, 3) [N], NaN for a model that has none,
-    and the centroids ``parts_mm`` (stages, parts, 3) of the parts; the time of each step in the stages, and
-    whether all positions are finite.
+    just arrived; the tissue's force on the probe ``force_n`` (stages, 3) [N], ``sliding_share`` and
+    ``friction_ratio`` (stages,) as in ``sim.surface_contact.ContactLoad``, NaN for a model that has none; the
+    centroids ``parts_mm`` (stages, parts, 3) of the parts; the time of each step in the stages, and whether
+    all positions are finite.
     """
 
     beads: np.ndarray
@@ -42,6 +43,8 @@ class BeadRun:
     finite: bool = True
     arriving: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
     force_n: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    sliding_share: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    friction_ratio: np.ndarray = field(default_factory=lambda: np.zeros(0))
     parts_mm: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
 
@@ -79,6 +82,7 @@ class BeadExperiment:
         pose = self._away()
         nothing = np.zeros_like(self.case.measured)
         run = BeadRun(nothing, arriving=nothing.copy(), force_n=np.full((len(nothing), 3), np.nan))
+        run.sliding_share, run.friction_ratio = np.full((2, len(nothing)), np.nan)
         run.parts_mm = np.zeros((len(nothing), len(self.case.parts), 3))
         moving = max(1, round(MOVING * setup.stage_steps))
         for stage, goal in enumerate(self.case.poses):
@@ -92,7 +96,9 @@ class BeadExperiment:
             run.beads[stage] = self._bead_positions()
             run.parts_mm[stage] = self._part_centroids()
             if isinstance(self.model.contacts, SurfaceContacts):
-                run.force_n[stage] = self.model.contacts.wrench(self.solver.tool, pose[:3, 3])[:3]
+                load = self.model.contacts.load(self.solver.tool, pose[:3, 3])
+                run.force_n[stage] = load.wrench[:3]
+                run.sliding_share[stage], run.friction_ratio[stage] = load.sliding_share, load.friction_ratio
             run.finite &= bool(np.isfinite(positions_of(self.solver)).all())
         run.finite &= bool(np.isfinite(run.beads).all())
         return run

@@ -163,6 +163,9 @@ def test_the_panel_shows_each_figure_under_its_name_with_its_unit(measurements, 
     always = {"compression": "8.3 mm", "contact": "123 mm2", "force": "0.52 N"}
     measurements.latest = Measurement(8.26, 123.4, force_n=0.517, torque_n_mm=9.9)
     assert measurements.findings() == always | {"organ seen": "12 %"}
+    for share, shown in ((0.5, {}), (0.62, {"slip": "62 % of contact"})):
+        measurements.latest = Measurement(8.26, 123.4, force_n=0.517, sliding_share=share)
+        assert measurements.findings() == always | shown | {"organ seen": "12 %"}
     measurements.latest = Measurement(8.26, 123.4, 20.11, 7.27, 3.38, 0.37, -4.96, 0.517, 9.9)
     assert measurements.findings() == always | {
         "to tumour": "20.1 mm",

@@ -20,7 +20,9 @@ SCENE = load_scene(EMBEDDED)
 WRENCH = np.array([0.0, 0.3, -0.4, 1.0, 2.0, 3.0])
 
 
-def rehearsed(volume: float, penetration_mm: float, indentation_mm: float) -> SimpleNamespace:
+def rehearsed(
+    volume: float, penetration_mm: float, indentation_mm: float, share: float = 0.5
+) -> SimpleNamespace:
     """What a tally asks of a rehearsal."""
     return SimpleNamespace(
         case=case_of_ball(scene=SCENE, probe=probe_of(SCENE)),
@@ -33,7 +35,7 @@ def rehearsed(volume: float, penetration_mm: float, indentation_mm: float) -> Si
         ),
         anatomy=SimpleNamespace(embedding=SimpleNamespace(count=6), volume_ratio=lambda: volume),
         indentation_mm=lambda: indentation_mm,
-        frame=SimpleNamespace(wrench=WRENCH / 2),
+        frame=SimpleNamespace(wrench=WRENCH / 2, sliding_share=share, friction_ratio=0.25),
     )
 
 
@@ -65,6 +67,7 @@ def test_figures_are_those_of_tissue_that_is_there(lost):
     assert report["force_max_n"] == (0.5 if lost is None else None)
     assert report["probe_force_n"] == ([0.0, 0.15, -0.2] if lost is None else None)
     assert report["probe_torque_n_mm"] == ([0.5, 1.0, 1.5] if lost is None else None)
+    assert report["friction_ratio"] == (0.25 if lost is None else None)
     assert report["fallbacks"] == ["restored"]
     # The first of each compiles kernels.
     tally.step_ms, tally.slice_ms = [900.0, 4.0, 5.5, 70.0], [800.0, 7.25]
@@ -76,5 +79,7 @@ def test_figures_are_those_of_tissue_that_is_there(lost):
         "indentation 3.50 mm at most, force 0.50 N at most; least volume 97.0 %; "
         "penetration at most 0.250 mm; all finite"
     )
+    slipped = summary(tally.report(rehearsed(0.99, 0.1, 1.5, share=0.75), "cpu"))
+    assert ("force 0.50 N at most, 75 % of the contact slides;" in slipped) == (lost is None)
     gone = "NOT FINITE: the tissue diverged, and there are no figures of it"
     assert press.removeprefix("press").strip() == (figures if lost is None else gone)

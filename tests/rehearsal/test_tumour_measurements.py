@@ -25,9 +25,11 @@ def posed(face=(0.0, 0.0, 40.0), probe=LINEAR) -> np.ndarray:
 
 
 def anatomy_of(
-    organ=None, tumour=None, shift=(0, 0, 0), now=None, pose=None, probe=LINEAR, outline=NOWHERE, wrench=None
+    organ=None, tumour=None, shift=(0, 0, 0), now=None, pose=None, probe=LINEAR, outline=NOWHERE, **load
 ) -> SimpleNamespace:
-    """What is measured: an organ at rest, or deformed as ``now``, and a tumour that has shifted."""
+    """What is measured: an organ at rest, or deformed as ``now``, and a tumour that has shifted; ``load`` is
+    what a frame has of the contact.
+    """
     organ = organ or ball(30.0)
     return SimpleNamespace(
         case=SimpleNamespace(size_mm=np.array(probe.housing_mm)),
@@ -35,7 +37,7 @@ def anatomy_of(
         vertices=np.asarray(organ.vertices if now is None else now, float),
         pose=posed() if pose is None else pose,
         tumour=tumour,
-        frame=SimpleNamespace(wrench=wrench),
+        frame=SimpleNamespace(**{"wrench": None, **load}),
         tumour_vertices=None if tumour is None else np.asarray(tumour.vertices) + shift,
         tumour_outline=lambda: None if tumour is None else outline,
     )
@@ -218,6 +220,8 @@ def test_a_piece_of_a_sector_in_a_curvilinear_picture(first, last, near, far, in
 
 
 def test_force_and_torque_are_the_sizes_of_the_wrench():
-    with_force = reading(wrench=np.array([1.0, -2.0, 2.0, 0.0, 6.0, 8.0]))
+    wrench = np.array([1.0, -2.0, 2.0, 0.0, 6.0, 8.0])
+    with_force = reading(wrench=wrench, sliding_share=0.75, friction_ratio=0.25)
     assert (with_force.force_n, with_force.torque_n_mm) == (3.0, 10.0)
+    assert (with_force.sliding_share, with_force.friction_ratio) == (0.75, 0.25)
     assert reading().force_n is None and reading().torque_n_mm is None

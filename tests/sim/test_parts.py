@@ -69,13 +69,23 @@ def test_without_parts_there_are_no_shares(one_device, organ):
     assert not hasattr(NeoHookean(Body(lattice.nodes), lattice), "lame_ratio")
 
 
-def test_the_mixture_is_the_mean_by_volume():
+def hill_mean(shares, moduli) -> float:
+    voigt = sum(share * modulus for share, modulus in zip(shares, moduli, strict=True))
+    reuss = 1 / sum(share / modulus for share, modulus in zip(shares, moduli, strict=True))
+    assert reuss < voigt
+    return (voigt + reuss) / 2
+
+
+def test_the_mixture_has_hills_moduli_and_the_mean_density():
     stiff, light = Material(60.0, 0.3, 2.0), Material(1.0, 0.499, 0.9)
     share = np.array([[0.0, 0.0], [1.0, 0.0], [0.25, 0.5]])
     mu, lambda_, density = mixture(OUTSIDE, [stiff, light], share)
-    for mean, name in ((mu, "mu"), (lambda_, "lambda_"), (density, "density")):
-        out, first, second = (getattr(m, name) for m in (OUTSIDE, stiff, light))
-        assert mean == pytest.approx([out, first, 0.25 * out + 0.25 * first + 0.5 * second], rel=1e-12)
+    for mean, name in ((mu, "mu"), (lambda_ + 2 / 3 * mu, "bulk")):
+        moduli = [getattr(material, name) for material in (OUTSIDE, stiff, light)]
+        assert mean == pytest.approx([*moduli[:2], hill_mean((0.25, 0.25, 0.5), moduli)], rel=1e-12)
+    assert 1e3 * density == pytest.approx([1.05, 2.0, 0.25 * 1.05 + 0.25 * 2.0 + 0.5 * 0.9], rel=1e-12)
+    # E = 9 K mu / (3 K + mu).
+    assert 9 * stiff.bulk * stiff.mu / (3 * stiff.bulk + stiff.mu) == pytest.approx(60e3, rel=1e-12)
     assert (OUTSIDE.mu, OUTSIDE.lambda_) == pytest.approx(lame_parameters(0.45), rel=1e-12)
 
 
@@ -122,8 +132,8 @@ def test_masses_are_those_of_the_materials(organ):
 
 
 def test_layers_in_series_yield_as_springs_in_series(one_device):
-    """With nu = 0 a column of layers is a chain of springs; the layer that the interface cuts has the mean
-    modulus.
+    """With nu = 0 a column of layers is a chain of springs; the layer that the interface cuts has Hill's mean
+    of the moduli.
 
     Its ends are moved by 1 % of the length, where Hooke's law is off by about that.
     """
@@ -142,9 +152,30 @@ def test_layers_in_series_yield_as_springs_in_series(one_device):
     for _ in range(200):
         solver.step(settings_of(20))
     moved = (position(solver) - lattice.nodes)[:, 2]
-    compliance = 1 / (15.0 + 75.0 * share)
+    compliance = 1 / np.array([(15 + 75 * s + 1 / ((1 - s) / 15 + s / 90)) / 2 for s in share])
     wanted = 0.01 * layers * cell * np.append(0, np.cumsum(compliance)) / compliance.sum()
     assert np.abs(moved - wanted[level]).max() < 0.02 * wanted.max()
-    # Reuss's mean, the exact one here, would move the levels above the cut by this much: more than the
-    # tolerance.
     assert np.ptp(moved[level == 4]) < 1e-3
+
+
+@pytest.mark.parametrize("young_kpa", [0.15, 90.0])
+def test_a_ball_in_sheared_tissue_strains_as_eshelby_has_it(one_device, young_kpa):
+    """The strain inside is even (Eshelby 1957); the block is large enough that its faces change it by 1 %.
+
+    The ball's radius is two elements. With Voigt's mean the soft ball is 10 % off, with Reuss's 23 %.
+    """
+    cell, count, radius, shear = 4.0, 15, 8.0, 0.01
+    lattice = fill_block((count,) * 3, cell, [ball_at([(count / 2 + 0.3) * cell] * 3, radius)])
+    at_faces = (lattice.nodes < 1e-6) | (lattice.nodes > count * cell - 1e-6)
+    model = NeoHookean(
+        Body(lattice.nodes), lattice, None, OUTSIDE, [Material(young_kpa, 0.45)], fixed=at_faces.any(axis=1)
+    )
+    put(model, lattice.nodes + shear * np.outer(lattice.nodes[:, 2], [1, 0, 0]))
+    solver = Solver(model)
+    for _ in range(60):
+        solver.step(settings_of(20))
+    inside = lattice.share[:, 0] > 0.999
+    deformation = np.einsum("mka,mkb->mab", position(solver)[lattice.cells[inside]], lattice.gradient[inside])
+    strain = (deformation[:, 0, 2] + deformation[:, 2, 0]).mean() / shear
+    beta = 2 * (4 - 5 * 0.45) / (15 * (1 - 0.45))
+    assert strain == pytest.approx(1 / (1 + beta * (young_kpa / 15.0 - 1)), rel=0.08)

@@ -12,7 +12,7 @@ from sim.body import BodyState
 from sim.fields import array_of, fill, zeros
 from sim.kernels import kernel
 from sim.shapes import ConvexTool, Plane, SignedDistanceField
-from sim.surface_contact import NEAR_MM, PENALTY_DEPTH_MM, REACH_MM, TANGENTIAL_RATIO
+from sim.surface_contact import NEAR_MM, PENALTY_DEPTH_MM, REACH_MM, SLIDING, TANGENTIAL_RATIO
 
 FRICTION = 0.35
 UP = np.array([0.0, 0.0, 1.0])
@@ -53,7 +53,7 @@ def rest(solver, steps, settings, poses=None) -> None:
 
 def contact_force(solver, shape) -> np.ndarray:
     """Sum (3,) [uN] of the forces of a shape on the body after its last step."""
-    return -1e6 * solver.contacts.wrench(shape, np.zeros(3))[:3]
+    return -1e6 * solver.contacts.load(shape, np.zeros(3)).wrench[:3]
 
 
 def on_plane(mesh, friction=FRICTION):
@@ -95,6 +95,14 @@ def test_a_block_sticks_below_the_friction_angle_and_slides_above(kept, block, f
         held = min(np.sin(angle), friction * np.cos(angle))
         assert force == pytest.approx([-held, 0.0, np.cos(angle)], abs=tolerance * np.cos(angle))
         last[beyond_deg] = speed
+        load = solver.contacts.load(solver.contacts.shapes[0], np.zeros(3))
+        # Sliding, each point bears the coefficient's share of its normal force. Held, the points bear at
+        # least the slope's, and those that the block's own spreading pulls along may slide.
+        if beyond_deg > 0:
+            assert load.friction_ratio == pytest.approx(friction, rel=1e-5) and load.sliding_share == 1.0
+        else:
+            assert (1 - tolerance) * np.tan(angle) < load.friction_ratio < friction
+            assert load.sliding_share < 1.0
     # It is at rest, to the rounding of 1e-5 mm a step; and it gathers speed as Coulomb has it, damping off.
     assert abs(last[-1.0][1]) < 1e-2
     slope = np.arctan(friction) + np.radians(1.0)
@@ -244,6 +252,17 @@ def test_contact_points_follow_their_nodes_under_over_relaxation(kept, dome):
     assert np.abs(array_of(contacts.point) - carried).max() < 4 * 8 * ULP_MM
 
 
+def test_nothing_slides_without_contact_or_friction(kept, dome, one_device, block):
+    solver = kept(pressed_dome, dome)
+    rest(solver, 2, settings_of(20, DOWN), AWAY)
+    load = solver.contacts.load(solver.tool, np.zeros(3))
+    assert (load.wrench == 0).all() and (load.sliding_share, load.friction_ratio) == (0.0, 0.0)
+    smooth = on_plane(block, 0.0)
+    rest(smooth, 20, settings_of(20, (G / 2, 0.0, -G)))
+    load = smooth.contacts.load(smooth.contacts.shapes[0], np.zeros(3))
+    assert load.wrench[2] < 0 and (load.sliding_share, load.friction_ratio) == (0.0, 0.0)
+
+
 def test_slip_is_cleared_when_contact_ends(kept, dome):
     solver = kept(pressed_dome, dome)
     press(solver, 2.0, settings_of(20, DOWN), 30)
@@ -380,10 +399,16 @@ def test_the_wrench_is_the_sum_of_the_forces_on_the_points(one_device, block):
     force -= TANGENTIAL_RATIO * (stiffness * (depth > 0))[:, None] * slip
     wanted = -1e-6 * np.concatenate([force.sum(axis=0), np.cross(point - about, force).sum(axis=0)])
     # A depth is a difference of positions of 10 mm, off by 1e-6 mm of 0.05.
-    assert contacts.wrench(tool, about) == pytest.approx(wanted, rel=1e-3, abs=1e-4 * np.abs(wanted).max())
+    load = contacts.load(tool, about)
+    assert load.wrench == pytest.approx(wanted, rel=1e-3, abs=1e-4 * np.abs(wanted).max())
     assert wanted[2] > 0.5 and wanted[0] < -0.05 * wanted[2]
+    normal, friction = stiffness * depth, TANGENTIAL_RATIO * stiffness * np.linalg.norm(slip, axis=1)
+    slides = (depth > 0) & (friction > SLIDING * FRICTION * normal)
+    assert load.friction_ratio == pytest.approx(friction[depth > 0].sum() / normal.sum(), rel=1e-3)
+    assert load.sliding_share == pytest.approx(normal[slides].sum() / normal.sum(), rel=1e-3)
+    assert 0.02 < load.sliding_share < 0.98
     # At rest the floor carries the weight and the press.
     for _ in range(100):
         solver.step(settings_of(8, gravity=(0.0, 0.0, -G)))
-    total = contacts.wrench(tool, about)[:3] + contacts.wrench(floor, about)[:3]
+    total = contacts.load(tool, about).wrench[:3] + contacts.load(floor, about).wrench[:3]
     assert total == pytest.approx([0, 0, -1e-6 * weight(solver)], abs=0.01 * wanted[2])

@@ -19,6 +19,7 @@ from scenes.tissue import QUALITIES, TISSUES
 from sim.fields import array_of
 from studies.accuracy.bead_case import BeadCase, load_case
 from studies.accuracy.bead_errors import (
+    SLIP,
     bead_errors,
     correlation,
     force_figures,
@@ -108,7 +109,14 @@ def experiment(one_device, case) -> BeadExperiment:
 def test_report_and_table_show_these_figures(experiment, case):
     off = np.linspace(0, 1, 12)[:, None] * np.array([0.0, 0.0, 1.0])
     unknown = np.full((3, 3), np.nan)
-    run = BeadRun(case.measured + off, step_ms=[1.0, 2.0, 6.0], force_n=unknown, parts_mm=np.zeros((3, 0, 3)))
+    run = BeadRun(
+        case.measured + off,
+        step_ms=[1.0, 2.0, 6.0],
+        force_n=unknown,
+        sliding_share=unknown[0],
+        friction_ratio=unknown[0],
+        parts_mm=np.zeros((3, 0, 3)),
+    )
     figures = report(experiment, COARSE, run)
     assert set(figures) == KEYS | {"clusters", "memberships"} and figures["case"] == "ball"
     assert figures["overall_mean_mm"] == pytest.approx(0.5)
@@ -232,11 +240,25 @@ def test_a_real_case_is_pressed(one_device, data):
 def test_forces_are_compared_as_vectors_and_what_is_unknown_is_none(case):
     known = replace(case, probe_force_n=np.array([[0.0, 0, 0], [0, 0, 2.0], [np.nan] * 3]))
     found = np.array([[0.0, 0, 0.01], [0.3, 0, 2.4], [0, 0, 4.0]])
-    run = BeadRun(case.measured, force_n=found, parts_mm=np.zeros((3, 0, 3)))
+    slides, ratio = np.array([0.0, 0.4, 0.75]), np.array([0.0, 0.25, 0.35])
+    run = BeadRun(
+        case.measured, force_n=found, sliding_share=slides, friction_ratio=ratio, parts_mm=np.zeros((3, 0, 3))
+    )
     figures = force_figures(known, run)
     assert figures[1]["probe_force_N"] == [0.3, 0, 2.4] and figures[1]["measured_probe_force_N"] == [0, 0, 2]
     assert figures[2]["measured_probe_force_N"] is None
-    rows = force_table(known, found).splitlines()[1:]
+    assert [(row["sliding_share"], row["friction_ratio"]) for row in figures] == [
+        (0, 0),
+        (0.4, 0.25),
+        (0.75, 0.35),
+    ]
+    rows = force_table(known, run).splitlines()[1:]
     # 0.5 N of 2 N; of no force there is no share.
-    assert rows[1].split()[-2:] == ["0.500", "25.0"] and rows[0].split()[-1] == "0.010"
+    assert rows[1].split()[-4:] == ["0.500", "25.0", "40", "0.25"] and rows[0].split()[-3:] == [
+        "0.010",
+        "0",
+        "0.00",
+    ]
     assert "not known" in rows[2]
+    assert rows[3] == SLIP.format("2")
+    assert len(force_table(known, replace(run, sliding_share=slides / 2)).splitlines()) == 4
