@@ -106,5 +106,4 @@ def _first(mask: np.ndarray) -> np.ndarray:
 
 def _lasting(mask: np.ndarray, count: int) -> np.ndarray:
     """Where ``count`` columns of a mask (n, m), from this one on, are true."""
-    windows = np.lib.stride_tricks.sliding_window_view(mask, count, axis=1)
-    return windows.all(axis=-1)
+    return np.logical_and.reduce(np.lib.stride_tricks.sliding_window_view(mask, count, axis=1), axis=-1)

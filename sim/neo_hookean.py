@@ -18,7 +18,7 @@ import taichi as ti
 import taichi.math as tm
 import trimesh
 
-from sim.attachment import total_stiffness
+from sim.attachment import PerirenalFat, total_stiffness
 from sim.body import Body
 from sim.capsule import N_MM, Capsule
 from sim.device import is_too_small
@@ -79,7 +79,10 @@ class NeoHookean:
         if inputs.shapes:
             spacing_mm = POINT_SPACING_CELLS * tissue.cell_mm
             points, area_mm2 = stored(surface_points, inputs.organ, spacing_mm)
-            contacts = SurfaceContacts(body, lattice, points, area_mm2, inputs.shapes, inputs.friction)
+            # What the organ lies on is behind its fat, which holds it instead of friction.
+            in_fat = any(isinstance(tether, PerirenalFat) for tether in inputs.tethers)
+            surface = points, area_mm2, inputs.shapes
+            contacts = SurfaceContacts(body, lattice, *surface, inputs.friction, support_is_smooth=in_fat)
         material = Material(tissue.young_kpa, tissue.poisson, tissue.density_g_cm3)
         parts = [part.material for part in inputs.parts]
         fixed = None

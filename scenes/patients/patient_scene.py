@@ -89,15 +89,16 @@ def fat_row(patient: Patient, scene: Scene) -> tuple[str, str]:
     assert scene.press.direction is not None
     free = removed(attachment, patient.organ, patient.tumour, -np.array(scene.press.direction))
     shown = thickness[~free & np.isfinite(thickness)]
-    hidden = area_mm2[~free & np.isnan(thickness)].sum() / area_mm2.sum()
-    words = [
-        f"{attachment.fat_young_kpa:g} kPa",
-        f"{np.median(shown):.0f} mm thick by HU (median)" if len(shown) else "",
-        f"removed from {area_mm2[free].sum() / area_mm2.sum():.0%} of the surface, where the probe comes from"
-        + (f" and {attachment.freed_margin_mm:g} mm around the tumour" if patient.tumour else ""),
-        f"not shown by the CT on {hidden:.0%}: {attachment.fat_kpa_mm:g} kPa/mm there" if hidden else "",
-    ]
-    return "fat", "; ".join(filter(None, words))
+    freed, hidden = (
+        100 * area_mm2[mask].sum() / area_mm2.sum() for mask in (free, ~free & np.isnan(thickness))
+    )
+    thick = f", {np.median(shown):.0f} mm thick (median, by HU)" if len(shown) else ""
+    around = f", and {attachment.freed_margin_mm:g} mm around the tumour" if patient.tumour else ""
+    return (
+        "fat",
+        f"{attachment.fat_young_kpa:g} kPa{thick}; removed from {freed:.0f} % of the surface: towards the "
+        f"probe{around}; {hidden:.0f} % not shown by the CT: {attachment.fat_kpa_mm:g} kPa/mm there",
+    )
 
 
 def patient_scene(

@@ -9,7 +9,7 @@ from rehearsal.pressed_organ import PressedOrgan
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.patients.patient_scene import hilum
 from scenes.phantom.embedded_patient import phantom_folder
-from scenes.scene import PAPER, AnatomyFiles, Attachment, Scene, load_scene, with_options
+from scenes.scene import PAPER, AnatomyFiles, Attachment, PlaneShape, Scene, load_scene, with_options
 from sim.attachment import PerirenalFat
 from sim.fields import array_of
 from sim.lattice import fill_with_cells
@@ -18,8 +18,8 @@ from sim.sampling import SamplingError
 AT = (-15.0, 0.0, 0.0)
 
 
-def ball_held_by(cell_mm: float = 4.0, **attachment) -> PressedOrgan:
-    """A ball without support: without an attachment it falls."""
+def ball_held_by(cell_mm: float = 4.0, shapes: tuple = (), **attachment) -> PressedOrgan:
+    """A ball among shapes: without these and an attachment it falls."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=15.0)
     scene = Scene(
         anatomy=AnatomyFiles(),
@@ -27,7 +27,7 @@ def ball_held_by(cell_mm: float = 4.0, **attachment) -> PressedOrgan:
         press={"warm_up_steps": 0, "direction": (0, 0, 1), "target_mm": (0, 0, 0)},
     )
     scene = with_options(scene, {"tissue.cell_mm": cell_mm})
-    return PressedOrgan(case_of(scene, LoadedAnatomy(ball, None, None, ())))
+    return PressedOrgan(case_of(scene, LoadedAnatomy(ball, None, None, shapes)))
 
 
 def moved_mm(organ: PressedOrgan, steps: int = 30) -> np.ndarray:
@@ -160,6 +160,22 @@ def test_the_force_in_a_step_is_that_of_the_springs(device):
     # Over a ball the mean of n n^T is 1/3, so that k (1/3 + 2/3 1/3) acts in each direction.
     stiffness_n_mm = 4 * np.pi * 15.0**2 * 0.05e-3 * 5 / 9
     assert sag == pytest.approx(weight_n / stiffness_n_mm, rel=0.03) and sag > 0.5
+
+
+def test_an_organ_in_fat_returns_to_its_place_on_a_support(device):
+    """Pushed along the floor and left alone, it comes back; friction on the floor would hold it."""
+    floor = PlaneShape(kind="plane", normal=(0.0, -1.0, 0.0), offset_mm=-15.0)
+    organ = ball_held_by(4.0, (floor,), fat_kpa_mm=0.01, freed_deg=0.0)
+    moved_mm(organ, 120)
+    settled = array_of(organ.body.position)
+    down = organ.settings.gravity
+    organ.settings.gravity = (3000.0, *down[1:])
+    pushed = moved_mm(organ, 30) + organ.body.rest_points - settled
+    assert pushed[:, 0].mean() > 0.5
+    organ.settings.gravity = down
+    back = moved_mm(organ, 240) + organ.body.rest_points - settled
+    assert np.abs(back).max() < 0.01
+    assert [*organ.contacts.is_rough] == [False, True]
 
 
 def test_a_deeper_hollow_of_the_other_side_is_no_hilum():
