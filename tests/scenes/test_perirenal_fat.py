@@ -49,7 +49,7 @@ def middle_of(block: trimesh.Trimesh, side: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "side, thickness_mm", zip(NAMES, [8.0, RIM_MM, 20.0, np.nan, REACH_MM, np.nan], strict=True)
+    "side, thickness_mm", [*zip(NAMES, [8.0, RIM_MM, 20.0, np.nan, REACH_MM, np.nan], strict=True)]
 )
 def test_a_layer_is_as_thick_as_it_was_drawn(block, ct, side, thickness_mm):
     hu, grid = ct
