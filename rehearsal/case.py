@@ -30,7 +30,8 @@ class Case:
     """What is rehearsed. Positions are mm relative to ``origin`` (3,), the middle of the resting organ (LPS).
 
     ``parts`` are surfaces in the organ by tissue, the tumour apart; ``shapes`` are the rigid ones around it,
-    relative to the patient (LPS); ``press`` has a value for all that the scene leaves open.
+    relative to the patient (LPS); ``press`` has a value for all that the scene leaves open. ``fat_mm``
+    (faces,) is that of ``LoadedAnatomy``.
     """
 
     scene: Scene
@@ -41,6 +42,7 @@ class Case:
     parts: dict[str, trimesh.Trimesh]
     shapes: tuple[PlaneShape | trimesh.Trimesh | Grid, ...]
     press: Press
+    fat_mm: np.ndarray | None
 
     @property
     def gravity_direction(self) -> np.ndarray:
@@ -104,6 +106,7 @@ def case_of(scene: Scene, anatomy: LoadedAnatomy, probe: Probe | None = None) ->
         {tissue: translated(part, -origin) for tissue, part in anatomy.parts.items()},
         anatomy.shapes,
         press_on(scene.press, anatomy, gravity),
+        anatomy.fat_mm,
     )
 
 

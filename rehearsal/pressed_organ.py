@@ -19,6 +19,7 @@ from rehearsal.resection.score_line import ResectionError
 from rehearsal.stopwatch import timed
 from scenes.anatomy import Grid
 from scenes.mechanical_tissues import mechanical_properties
+from scenes.perirenal_fat import foundation_kpa_mm
 from scenes.scene import Attachment, Gravity, PlaneShape, SceneError, SolverSection
 from scenes.surfaces import translated
 from scenes.tissue import PartMaterial, PartName, TissueSection
@@ -85,7 +86,7 @@ class PressedOrgan:
         self.tool = tool_of(case.probe)
         shapes = [*(self._shape(shape) for shape in case.shapes), self.tool]
         tissue, section = case.scene.tissue, case.scene.solver
-        fixed, tethers = attachments_of(case.scene.attachment, case.origin, np.array(case.press.direction))
+        fixed, tethers = attachments_of(case, case.scene.attachment)
         self.parts_of_tissue = parts_of(case)
         self.solver = build_solver(
             case.organ,
@@ -163,6 +164,8 @@ class PressedOrgan:
         yield from (
             self.case.probe.model_dump_json(),
             self.case.organ,
+            self.case.tumour,
+            self.case.fat_mm,
             self.case.origin,
             self.pose,
             repr(self.case.press.direction),
@@ -323,22 +326,22 @@ def within_force(pose: np.ndarray, goal: np.ndarray, force_n: np.ndarray, limit_
     return moved
 
 
-def attachments_of(
-    attachment: Attachment, origin: np.ndarray, press_direction: np.ndarray
-) -> tuple[list[FixedRegion], list[Tether]]:
-    """What a scene's attachment fixes and what holds it elastically, relative to an origin; fat leaves the
-    pressed side free.
+def attachments_of(case: Case, attachment: Attachment) -> tuple[list[FixedRegion], list[Tether]]:
+    """What an attachment of a case's organ fixes and what holds it elastically, relative to its origin; the
+    surgeon comes from where the probe does, unless the attachment names the approach.
     """
     fixed: list[FixedRegion] = []
     tethers: list[Tether] = []
     if attachment.radius_mm > 0 and attachment.at_mm is not None:
-        place = np.array(attachment.at_mm) - origin, attachment.radius_mm
+        place = np.array(attachment.at_mm) - case.origin, attachment.radius_mm
         if attachment.stiffness_n_mm > 0:
             tethers.append(Pedicle(*place, attachment.stiffness_n_mm))
         else:
             fixed.append(FixedRegion(*place))
-    if attachment.fat_kpa_mm > 0:
-        tethers.append(PerirenalFat(attachment.fat_kpa_mm, -press_direction))
+    if attachment.has_fat:
+        approach = -np.array(case.press.direction)
+        around = attachment, case.organ, case.tumour, case.fat_mm, approach
+        tethers.append(PerirenalFat(foundation_kpa_mm(*around)))
     return fixed, tethers
 
 

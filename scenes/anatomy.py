@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from scenes.perirenal_fat import fat_thickness
 from scenes.phantom.embedded_patient import phantom_folder
 from scenes.scene import (
     AnatomyFiles,
@@ -48,14 +49,20 @@ class LoadedAnatomy:
     corrections: Grid | None = None
     corrected_tissues: dict[int, str] = field(default_factory=dict)
     """The tissue of each value of the corrections."""
+    fat_mm: np.ndarray | None = None
+    """Thickness (faces,) [mm] of the fat before each face of the organ (``fat_thickness``), where a CT shows
+    it and the scene needs it.
+    """
 
 
 def load_anatomy(scene: Scene, folder: Path, progress: ReportProgress = no_progress) -> LoadedAnatomy:
     """Read the files of a scene, relative to ``folder``. Raises SceneError, PatientError."""
     folder, anatomy = files_of(scene, folder, progress)
     ct = _grid(folder, anatomy.ct) if anatomy.ct else None
+    organ = load_surface(folder / anatomy.organ)
+    has_fat = scene.attachment.fat_young_kpa > 0
     return LoadedAnatomy(
-        organ=load_surface(folder / anatomy.organ),
+        organ=organ,
         tumour=load_surface(folder / anatomy.tumour) if anatomy.tumour else None,
         ct=ct,
         shapes=tuple(_shape(folder, shape) for shape in scene.shape),
@@ -64,6 +71,7 @@ def load_anatomy(scene: Scene, folder: Path, progress: ReportProgress = no_progr
         parts={tissue: load_surface(folder / file) for tissue, file in anatomy.parts.items()},
         corrections=_grid(folder, anatomy.corrections) if anatomy.corrections else None,
         corrected_tissues={int(value): tissue for value, tissue in anatomy.corrected_tissues.items()},
+        fat_mm=fat_thickness(organ, ct.voxels, ct.index_from_mm) if ct and has_fat else None,
     )
 
 

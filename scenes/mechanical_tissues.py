@@ -31,12 +31,13 @@ class PartProperties(Section):
 
 
 class MechanicalProperties(Section):
-    """Low, typical and high values: stiffness of capsule and pedicle [N/mm], of perirenal fat [kPa/mm],
-    friction, and the parts' own.
+    """Low, typical and high values: stiffness of capsule and pedicle [N/mm], Young's modulus of perirenal
+    fat [kPa], stiffness of a layer of it [kPa/mm], friction, and the parts' own.
     """
 
     capsule_n_mm: Range
     pedicle_n_mm: Range
+    fat_young_kpa: Range
     fat_kpa_mm: Range
     friction: Range
     parts: dict[str, PartProperties]

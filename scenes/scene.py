@@ -103,14 +103,21 @@ class Attachment(Section):
     """What holds the organ: its pedicle at the hilum, and perirenal fat.
 
     The tissue within ``radius_mm`` of ``at_mm`` is tied to its place at rest by a tether of
-    ``stiffness_n_mm`` in all; with 0 it is fixed. A radius of 0: no pedicle. ``fat_kpa_mm`` is the stiffness
-    of the fat around the organ, but for the side that faces the transducer; 0: none.
+    ``stiffness_n_mm`` in all; with 0 it is fixed. A radius of 0: no pedicle. ``fat_young_kpa`` is Young's
+    modulus of the fat, whose thickness the CT shows; ``fat_kpa_mm`` the stiffness of the fat where no CT
+    shows it. Both 0: no fat. The surgeon has removed it where the surface faces ``approach``, which points
+    from the organ to him and is by default against the press, within ``freed_deg``; and where a tumour is
+    nearer than ``freed_margin_mm``.
     """
 
     at_mm: Vector3 | None = None
     radius_mm: float = Field(0.0, ge=0, le=100)
     stiffness_n_mm: float = Field(0.0, ge=0, le=1000)
+    fat_young_kpa: float = Field(0.0, ge=0, le=1000)
     fat_kpa_mm: float = Field(0.0, ge=0, le=1000)
+    approach: Direction | None = None
+    freed_deg: float = Field(90.0, ge=0, le=180)
+    freed_margin_mm: float = Field(15.0, ge=0, le=100)
 
     @model_validator(mode="after")
     def _somewhere(self) -> "Attachment":
@@ -126,9 +133,14 @@ class Attachment(Section):
         return self
 
     @property
+    def has_fat(self) -> bool:
+        """Whether there is perirenal fat."""
+        return self.fat_young_kpa > 0 or self.fat_kpa_mm > 0
+
+    @property
     def holds(self) -> bool:
         """Whether anything holds the organ."""
-        return self.radius_mm > 0 or self.fat_kpa_mm > 0
+        return self.radius_mm > 0 or self.has_fat
 
 
 class PlaneShape(Section):
@@ -313,7 +325,7 @@ class Scene(Section):
             (
                 self.attachment.holds,
                 "attachment",
-                "attachment.radius_mm and fat_kpa_mm hold nodes: {}, or them to 0",
+                "attachment.radius_mm, fat_young_kpa and fat_kpa_mm hold nodes: {}, or them to 0",
             ),
         ):
             able = [name for name, tissue in TISSUES.items() if getattr(tissue, f"supports_{support}")]

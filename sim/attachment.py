@@ -9,9 +9,14 @@ from typing import Protocol
 import igl
 import numpy as np
 import trimesh
+from scipy.sparse import csr_array
 
 from sim.lattice import Lattice, surface_points
 from sim.sampling import SamplingError
+
+# A layer of thickness t resists by E / t along its normal and G / t across; fat hardly changes its volume, so
+# that G = E / 3.
+SHEAR_RATIO = 1 / 3
 
 
 def nodes_within(nodes: np.ndarray, at_mm: np.ndarray, radius_mm: float) -> np.ndarray:
@@ -49,7 +54,7 @@ class Tether(Protocol):
     """Springs from the nodes to their places at rest."""
 
     def stiffness(self, lattice: Lattice, surface: trimesh.Trimesh) -> np.ndarray:
-        """Stiffness (n,) of each node's spring [N/mm]. Raises SamplingError."""
+        """Stiffness (n, 3, 3) of each node's spring [N/mm], symmetric. Raises SamplingError."""
         ...
 
 
@@ -64,32 +69,36 @@ class Pedicle:
     stiffness_n_mm: float
 
     def stiffness(self, lattice: Lattice, surface: trimesh.Trimesh) -> np.ndarray:
-        """The stiffness, shared by the volume of tissue of each node."""
+        """The stiffness, the same in all directions, shared by the volume of tissue of each node."""
         volume = lattice.node_mass(np.ones(len(lattice.cells)))
         volume *= nodes_within(lattice.nodes, self.at_mm, self.radius_mm)
-        return self.stiffness_n_mm * volume / volume.sum()
+        return (self.stiffness_n_mm * volume / volume.sum())[:, None, None] * np.eye(3)
 
 
 @dataclass(frozen=True)
 class PerirenalFat:
-    """Fat around the organ as an elastic foundation (Winkler): ``stiffness_kpa_mm`` on the surface, but
-    where it faces ``exposed`` (3,).
+    """Fat around the organ as an elastic foundation (Winkler): ``stiffness_kpa_mm`` (faces,) along the normal
+    of each face of the surface, and SHEAR_RATIO of it across.
     """
 
-    stiffness_kpa_mm: float
-    exposed: np.ndarray
+    stiffness_kpa_mm: np.ndarray
 
     def stiffness(self, lattice: Lattice, surface: trimesh.Trimesh) -> np.ndarray:
         """The stiffness times the area of surface of each node."""
         points, area_mm2 = surface_points(surface, lattice.cell_mm / 2)
         faces = np.asarray(surface.faces, np.int64)
         face = igl.point_mesh_squared_distance(points, np.asarray(surface.vertices, float), faces)[1]
-        covered = surface.face_normals[face] @ self.exposed <= 0
+        normal = surface.face_normals[face]
+        n_mm = 1e-3 * self.stiffness_kpa_mm[face] * area_mm2
+        along = normal[:, :, None] * normal[:, None, :]
+        per_point = n_mm[:, None, None] * (SHEAR_RATIO * np.eye(3) + (1 - SHEAR_RATIO) * along)
         nodes, weights = lattice.interpolation.attach(points)
-        per_point = 1e-3 * self.stiffness_kpa_mm * area_mm2 * covered
-        return np.bincount(nodes.ravel(), (per_point[:, None] * weights).ravel(), len(lattice.nodes))
+        offsets = np.arange(0, nodes.size + 1, nodes.shape[1])
+        shape = len(points), len(lattice.nodes)
+        of_nodes = csr_array((weights.ravel(), nodes.ravel(), offsets), shape=shape).T
+        return (of_nodes @ per_point.reshape(-1, 9)).reshape(-1, 3, 3)
 
 
 def total_stiffness(tethers: Sequence[Tether], lattice: Lattice, surface: trimesh.Trimesh) -> np.ndarray:
-    """Stiffness (n,) of all tethers on each node [N/mm]. Raises SamplingError."""
+    """Stiffness (n, 3, 3) of all tethers on each node [N/mm]. Raises SamplingError."""
     return np.sum([tether.stiffness(lattice, surface) for tether in tethers], axis=0)

@@ -18,7 +18,7 @@ import taichi as ti
 import taichi.math as tm
 import trimesh
 
-from sim.attachment import total_stiffness
+from sim.attachment import PerirenalFat, total_stiffness
 from sim.body import Body
 from sim.capsule import N_MM, Capsule
 from sim.device import is_too_small
@@ -79,7 +79,10 @@ class NeoHookean:
         if inputs.shapes:
             spacing_mm = POINT_SPACING_CELLS * tissue.cell_mm
             points, area_mm2 = stored(surface_points, inputs.organ, spacing_mm)
-            contacts = SurfaceContacts(body, lattice, points, area_mm2, inputs.shapes, inputs.friction)
+            # What the organ lies on is behind its fat, which holds it instead of friction.
+            in_fat = any(isinstance(tether, PerirenalFat) for tether in inputs.tethers)
+            surface = points, area_mm2, inputs.shapes
+            contacts = SurfaceContacts(body, lattice, *surface, inputs.friction, support_is_smooth=in_fat)
         material = Material(tissue.young_kpa, tissue.poisson, tissue.density_g_cm3)
         parts = [part.material for part in inputs.parts]
         fixed = None
@@ -137,7 +140,7 @@ class NeoHookean:
             self.fixed = field_of(fixed)
         self.has_tether = tether_n_mm is not None
         if tether_n_mm is not None:
-            self.tether = field_of(N_MM * tether_n_mm)
+            self.tether = field_of(N_MM * tether_n_mm, 2)
         self._whole_tether = tether_n_mm
         self._whole_points = None if contacts is None else (contacts.rest_points, contacts.rest_area_mm2)
         self.load_g = load_g
@@ -241,7 +244,8 @@ class NeoHookean:
             self._fill_stiffness(np.ones(self.count))
         if self._whole_tether is not None:
             volume = [lattice.node_mass(np.ones(self.count)) for lattice in (self.lattice, whole)]
-            self.set_tether(self._whole_tether * np.minimum(volume[0] / volume[1], 1.0))
+            share = np.minimum(volume[0] / volume[1], 1.0)
+            self.set_tether(self._whole_tether * share[:, None, None])
         if self._whole_points is not None:
             spacing_mm = POINT_SPACING_CELLS * whole.cell_mm
             points = self._whole_points
@@ -253,7 +257,7 @@ class NeoHookean:
             self.capsule.set_share(share)
 
     def set_tether(self, tether_n_mm: np.ndarray) -> None:
-        """Change the stiffness (n,) of the springs [N/mm]; only where there were any from the start."""
+        """Change the stiffness (n, 3, 3) of the springs [N/mm]; only where there were any from the start."""
         fill((self.tether, N_MM * tether_n_mm))
 
     def counts(self) -> dict[str, int]:
@@ -324,8 +328,8 @@ class NeoHookean:
         force, hessian, least = self.elastic(i)
         force += inertia * (four(self.inertial_target[i]) - self.predicted[i])
         if ti.static(self.has_tether):
-            force += self.tether[i] * (four(self.body.rest[i]) - self.predicted[i])
-            inertia += self.tether[i]
+            force += four(self.tether[i] @ (self.body.rest[i] - self.predicted[i].xyz))
+            hessian += self.tether[i]
         hessian += inertia * tm.eye(3)
         if ti.static(self.has_capsule):
             tension, stiffness = self.capsule.node_force(i)

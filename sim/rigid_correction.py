@@ -112,10 +112,12 @@ def no_moments():
 
 class RigidCorrection:
     """Moves a body's predicted positions rigidly towards ``inertial_target`` (n,) [mm], weighted with
-    ``mass`` (n,) [g], and to the places at rest to which a ``tether`` (n,) [g/s^2] holds.
+    ``mass`` (n,) [g], and to the places at rest to which a ``tether`` (n, 3, 3) [g/s^2] holds.
 
     The unknowns are the translation and the rotation vector about the node ``centre``. The nodes' forces
-    depend on them by sums that are made once; the contacts' forces are summed in each Newton step.
+    depend on them by sums that are made once; the contacts' forces are summed in each Newton step. The force
+    of a tether is exact where the nodes are, and changes with the motion by its mean stiffness of all
+    directions: sums of no more than the moments, and no motion where the forces are in equilibrium.
     """
 
     def __init__(
@@ -202,8 +204,8 @@ class RigidCorrection:
             stiffness = self.mass[i] / (dt * dt)
             shift = stiffness * (self.inertial_target[i] - x)
             if ti.static(self.has_tether):
-                shift += self.tether[i] * (self.body.rest[i] - x)
-                stiffness += self.tether[i]
+                shift += self.tether[i] @ (self.body.rest[i] - x)
+                stiffness += self.tether[i].trace() / 3.0
             sums.stiffness += stiffness
             sums.arm += stiffness * arm
             sums.shift += shift

@@ -65,7 +65,8 @@ class SurfaceContacts:
     point (p,): current positions [mm]. plane (shapes, p): normal and offset of n . x >= offset [mm]. slip
     (shapes, p): elastic tangential slip [mm]. near (p,): bits of the shapes that are near. last_query
     (shapes, p): point and distance [mm] of the last distance query. ``stiffness`` [kPa/mm]: penalty
-    stiffness; ``coefficient``: Coulomb's, where there was friction from the start.
+    stiffness; ``coefficient``: Coulomb's, where there was friction from the start: on all shapes, or where
+    the ``support_is_smooth`` on those alone that move.
     """
 
     def __init__(
@@ -76,12 +77,14 @@ class SurfaceContacts:
         area_mm2: np.ndarray,
         shapes: list,
         friction: float,
+        support_is_smooth: bool = False,
     ) -> None:
         check_count(shapes)
         self.body = body
         self.shapes = list(shapes)
         self.time_of_impact = TimeOfImpact(shapes)
         self.coefficient, self.has_friction = friction, friction > 0
+        self.is_rough = [self.has_friction and (shape.moves or not support_is_smooth) for shape in shapes]
         self.count = len(points)
         self.rest_points, self.rest_area_mm2 = points, area_mm2
         self.point = zeros(self.count, 3, within=1)
@@ -262,7 +265,7 @@ class SurfaceContacts:
                         penalty = weight * 1e3 * self.stiffness * self.area[q]
                         force += penalty * depth * normal
                         tangential = 0.0
-                        if ti.static(self.has_friction):
+                        if ti.static(self.is_rough[s]):
                             slip, factor = self.tangential_slip(s, q, depth)
                             force -= penalty * TANGENTIAL_RATIO * slip
                             tangential = TANGENTIAL_RATIO * factor
@@ -294,7 +297,7 @@ class SurfaceContacts:
                     stiffness += penalty * normal.outer_product(normal)
                     if has_force:
                         force += penalty * depth * normal
-                        if ti.static(self.has_friction):
+                        if ti.static(self.is_rough[s]):
                             slip = tangential(self.slip[s, q] + shift - self.point[q], normal)
                             factor = sticking_fraction(slip, self.coefficient * depth / TANGENTIAL_RATIO)
                             force -= penalty * TANGENTIAL_RATIO * factor * slip
@@ -323,11 +326,12 @@ class SurfaceContacts:
         if ti.static(self.has_friction):
             for q in range(self.count):
                 for s in ti.static(range(len(self.shapes))):
-                    slip = tm.vec3(0.0)
-                    depth = self.depth(s, q)
-                    if depth > 0.0:
-                        slip, _ = self.tangential_slip(s, q, depth)
-                    self.slip[s, q] = slip
+                    if ti.static(self.is_rough[s]):
+                        slip = tm.vec3(0.0)
+                        depth = self.depth(s, q)
+                        if depth > 0.0:
+                            slip, _ = self.tangential_slip(s, q, depth)
+                        self.slip[s, q] = slip
 
     def load(self, shape: object, about: np.ndarray) -> ContactLoad:
         """The load of the tissue on a shape in the last step, with the torque about a point (3,) [mm].

@@ -131,7 +131,7 @@ def import_patient_command(
     from scenes.patients.import_request import import_request
     from scenes.patients.patient_complexity import complexity_of_patient
     from scenes.patients.patient_findings import findings_of
-    from scenes.patients.patient_scene import patient_scene, stiffness_row
+    from scenes.patients.patient_scene import fat_row, patient_scene, stiffness_row
 
     tissues = {TISSUE_OPTIONS[o]: label_words(text, o) for o, text in words.items() if text is not None}
     own = [] if organ is None else label_words(organ, "organ")
@@ -142,13 +142,14 @@ def import_patient_command(
     complexity = complexity_of_patient(patient)
     written = public(patient)
     scene = patient_scene(patient, uniform, probe, housing_mm)
-    rows = [*summary_rows(written, complexity), stiffness_row(scene)]
+    scene_rows = [stiffness_row(scene), fat_row(patient, scene)]
+    rows = [*summary_rows(written, complexity), *scene_rows]
     texts |= {
         "scene.toml": scene_text(scene),
         FINDINGS_FILE: findings_text(findings_of(written, complexity)),
     }
     save_patient(written, out, texts, lambda folder: draw_check(written, rows, folder))
-    click.echo(as_table([*summary_rows(patient, complexity), stiffness_row(scene)]))
+    click.echo(as_table([*summary_rows(patient, complexity), *scene_rows]))
     if (written.notes, written.warnings) != (patient.notes, patient.warnings):
         click.echo("Names of labels that may be a person's are shown here, and are not in the files.")
     click.echo(

@@ -15,10 +15,12 @@ from scenes.patients.part_surfaces import PARTS
 from scenes.patients.patient_import import Patient
 from scenes.patients.patient_position import GRAVITY
 from scenes.patients.readers.segment_names import Side
+from scenes.perirenal_fat import fat_thickness, removed
 from scenes.scene import AnatomyFiles, Attachment, Gravity, Image, MeshShape, Scene, Transducer
 from scenes.surfaces import depth_below_hull
 from scenes.tissue import NeoHookeanTissue, PartMaterial, PartName
 from scenes.tissue_classes.tissue_map import TISSUES
+from scenes.volumes.voxel_grid import VoxelGrid
 
 FAT_HU = -110.0
 LEAST_WINDOW_HU = 310.0  # up to 200 HU at least, or an unenhanced kidney is white
@@ -77,6 +79,28 @@ def stiffness_row(scene: Scene) -> tuple[str, str]:
     )
 
 
+def fat_row(patient: Patient, scene: Scene) -> tuple[str, str]:
+    """A row of the import's summary: the perirenal fat that holds the organ, where it is removed, and where
+    the CT does not show it.
+    """
+    attachment, area_mm2 = scene.attachment, patient.organ.area_faces
+    voxels = sitk.GetArrayViewFromImage(patient.ct).transpose(2, 1, 0).astype(np.float32)
+    thickness = fat_thickness(patient.organ, voxels, VoxelGrid.of(patient.ct).index_from_mm)
+    assert scene.press.direction is not None
+    free = removed(attachment, patient.organ, patient.tumour, -np.array(scene.press.direction))
+    shown = thickness[~free & np.isfinite(thickness)]
+    freed, hidden = (
+        100 * area_mm2[mask].sum() / area_mm2.sum() for mask in (free, ~free & np.isnan(thickness))
+    )
+    thick = f", {np.median(shown):.0f} mm thick (median, by HU)" if len(shown) else ""
+    around = f", and {attachment.freed_margin_mm:g} mm around the tumour" if patient.tumour else ""
+    return (
+        "fat",
+        f"{attachment.fat_young_kpa:g} kPa{thick}; removed from {freed:.0f} % of the surface: towards the "
+        f"probe{around}; {hidden:.0f} % not shown by the CT: {attachment.fat_kpa_mm:g} kPa/mm there",
+    )
+
+
 def patient_scene(
     patient: Patient,
     uniform: bool = False,
@@ -113,6 +137,8 @@ def patient_scene(
             at_mm=hilum(patient.organ, patient.side),
             radius_mm=PEDICLE_RADIUS_MM,
             stiffness_n_mm=mechanical_properties().pedicle_n_mm[1],
+            fat_young_kpa=mechanical_properties().fat_young_kpa[1],
+            fat_kpa_mm=mechanical_properties().fat_kpa_mm[1],
         ),
         shape=(MeshShape(kind="mesh", file="support.stl"),),
         transducer=Transducer(probe=probe),

@@ -72,7 +72,9 @@ def unknowns_of(scene: Scene, anatomy: LoadedAnatomy) -> list[Unknown]:
         unknowns.append(Unknown("capsule", "N/mm", *table.capsule_n_mm))
     if attachment.radius_mm > 0 and attachment.stiffness_n_mm > 0:
         unknowns.append(Unknown("pedicle", "N/mm", *table.pedicle_n_mm))
-    if attachment.fat_kpa_mm > 0:
+    if attachment.fat_young_kpa > 0 and anatomy.fat_mm is not None:
+        unknowns.append(Unknown("fat modulus", "kPa", *table.fat_young_kpa))
+    elif attachment.fat_kpa_mm > 0:
         unknowns.append(Unknown("fat", "kPa/mm", *table.fat_kpa_mm))
     if scene.contact.shape_friction > 0:
         unknowns.append(Unknown("friction", "", *table.friction, is_ratio=False))
@@ -101,11 +103,11 @@ def set_values(rehearsal: Rehearsal, values: Mapping[str, float]) -> None:
         model.capsule.set_stiffness(values["capsule"])
     if "friction" in values:
         organ.contacts.coefficient = values["friction"]
-    if "pedicle" in values or "fat" in values:
-        keys = {"stiffness_n_mm": "pedicle", "fat_kpa_mm": "fat"}
+    keys = {"stiffness_n_mm": "pedicle", "fat_young_kpa": "fat modulus", "fat_kpa_mm": "fat"}
+    if not values.keys().isdisjoint(keys.values()):
         changed = {key: values[name] for key, name in keys.items() if name in values}
         attachment = case.scene.attachment.model_copy(update=changed)
-        _, tethers = attachments_of(attachment, case.origin, np.array(case.press.direction))
+        _, tethers = attachments_of(case, attachment)
         model.set_tether(total_stiffness(tethers, model.lattice, case.organ))
 
 

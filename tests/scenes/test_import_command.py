@@ -88,9 +88,11 @@ def test_the_folder_is_a_scene(written):
     assert scene.title == "Left kidney"
     np.testing.assert_allclose(anatomy.tumour.center_mass, TUMOUR[0], atol=1.0)
     assert anatomy.organ.center_mass[0] > 0 and anatomy.ct.voxels.ndim == 3
-    # Held by its pedicle.
+    # Held by its pedicle, and by the fat that the CT shows.
     held = scene.attachment
     assert held.at_mm is not None and held.radius_mm == 20 and held.stiffness_n_mm == 2.0
+    assert (held.fat_young_kpa, held.fat_kpa_mm, held.approach) == (3.0, 0.3, None)
+    assert anatomy.fat_mm.shape == (len(anatomy.organ.faces),)
     assert {file.name for file in written.iterdir()} == {
         "check.png", "ct.nrrd", "import.json", "labels.nrrd",
         "organ.stl", "scene.toml", "support.stl", "tumour.stl",
@@ -124,7 +126,7 @@ def test_nothing_names_the_patient(written, hospital):
 def test_the_terminal_names_nobody_and_tells_the_facts(hospital, imported):
     out, _, printed = imported
     assert printed.endswith(f"then: {shell_command('rehearse', out)}\n")
-    for text in ("left kidney", "parenchyma 15, tumour 60 kPa", "The probe is drop-in"):
+    for text in ("left kidney", "parenchyma 15, tumour 60 kPa", "3 kPa, ", "The probe is drop-in"):
         assert text in printed
     for text in ("Doe", "Jane", "4711", "19600229", hospital[1].uid):
         assert text not in printed

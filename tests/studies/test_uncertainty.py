@@ -180,11 +180,11 @@ def test_the_command_reports_writes_and_is_read_again(tmp_path, monkeypatch, cap
     out = tmp_path / "out"
     assert app.main(["study", "uncertainty", "--samples", "8", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert "tumour modulus" in printed and "At 6 mm, over 72 presses:" in printed
+    assert "tumour modulus" in printed and "At 6 mm, over 80 presses:" in printed
     report, rows = written(out, "uncertainty")
     total = report["sobol_total"]["force_n"]
     assert max(total, key=lambda name: total[name]["total"]) == "tumour modulus"
-    assert len(rows) == 72
+    assert len(rows) == 80
     deepest = dict(
         tumour_shift_mm=2.0, to_tumour_mm=4.0, tumour_depth_mm=6.0, margin_mm=8.0, compression_mm=12.0
     )
