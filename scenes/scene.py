@@ -209,13 +209,14 @@ class Image(Section):
     """The ultrasound panel: the kind of image, its detail level (``rung`` in scenes of version 1.0), and the
     CT window.
 
-    The default depth is the probe's. An element is in contact where the organ is closer to the array than
-    ``contact_gap_mm``; with ``contact`` "tissue", where the CT shows anything but gas. ``outside`` "fluid": a
-    layer of irrigation fluid of ``fluid_gap_mm`` covers the organ, through which elements are in contact too;
-    in front of it is gas. Between two wet surfaces capillarity alone holds water up to twice its capillary
-    length, 2 x 2.7 mm; the default is an estimate of what it holds while the assistant irrigates: the ends of
-    a flat array of 36 mm are 8 mm above a surface with a radius of 24 mm. With ``atlas``, what the CT cannot
-    show is drawn from an atlas: pyramids without enhancement, the renal fascia, layers in muscle.
+    The default depth is the probe's. An element is in contact where the organ is in front of it, nearer
+    than ``contact_gap_mm``; with ``contact`` "tissue", where the CT shows anything but gas there.
+    ``outside`` "fluid": a layer of irrigation fluid of ``fluid_gap_mm`` covers the organ, through which
+    elements are in contact too; in front of it is gas. Between two wet surfaces capillarity alone holds water
+    up to twice its capillary length, 2 x 2.7 mm; the default is an estimate of what it holds while the
+    assistant irrigates: the ends of a flat array of 36 mm are 8 mm above a surface with a radius of 24 mm.
+    With ``atlas``, what the CT cannot show is drawn from an atlas: pyramids without enhancement, the renal
+    fascia, layers in muscle.
     """
 
     mode: Annotated[

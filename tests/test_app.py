@@ -120,8 +120,8 @@ def test_a_headless_press_reports_what_it_promises(pressed):
 
 def test_it_leaves_pictures_in_which_the_press_is_seen(pressed):
     slices = [np.asarray(Image.open(path)).astype(int) for path in sorted((pressed / "slices").glob("*.png"))]
-    # Echo and CT side by side, each 16 x 40 mm with the longer side as it was sampled.
-    assert len(slices) >= 3 and slices[0].shape == (512, 2 * 205)
+    # Echo and CT side by side, each 36 x 50 mm with the longer side as it was sampled.
+    assert len(slices) >= 3 and slices[0].shape == (512, 2 * 369)
     assert np.abs(slices[0] - slices[-1]).mean() > 10
     assert slices[0].std() > 30
     with Image.open(pressed / "press.webp") as animation:

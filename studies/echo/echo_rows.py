@@ -19,6 +19,7 @@ from ultrasound.probe import Probe, load_probe
 WIDTH_BAR, LEVEL_BAR_DB, SHIFT_BAR = 0.2, 3.0, 0.05
 DEPTHS_MM = {
     "drop-in": (9.0, 18.0, 30.0),
+    "micro": (9.0, 18.0, 30.0),
     "linear": (10.0, 24.0, 50.0),
     "curvilinear": (30.0, 60.0, 110.0),
     "phased": (20.0, 65.0, 125.0),
@@ -71,7 +72,7 @@ def rows() -> Iterator[Row]:
     parts = [
         (name, part)
         for name in DEPTHS_MM
-        for part in (lateral_widths, elevation_lengths, *((DROP_IN_PARTS) if name == "drop-in" else ()))
+        for part in (lateral_widths, elevation_lengths, *FURTHER_PARTS.get(name, ()))
     ]
     for name, part in tqdm(parts, desc="echo", unit="part"):
         phantom = phantoms.setdefault(name, EchoPhantom(load_probe(name)))
@@ -276,4 +277,9 @@ def _length(depth: np.ndarray, amplitude: np.ndarray) -> float:
     return float(np.sqrt(-4 * np.log(2) / curve))
 
 
-DROP_IN_PARTS = (speckle_statistics, edge_width, interfaces, cysts, attenuation, doppler_shifts)
+# The elements of ``micro`` are less than a wavelength apart: its array has no grating lobes, which are not
+# modelled, to fill its cysts.
+FURTHER_PARTS = {
+    "drop-in": (edge_width,),
+    "micro": (speckle_statistics, edge_width, interfaces, cysts, attenuation, doppler_shifts),
+}

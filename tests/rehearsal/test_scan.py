@@ -214,7 +214,7 @@ def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys, monkeypat
     assert 0 < (~grey).mean() < 0.5 and (doppler[~grey][:, 0] > doppler[~grey][:, 2]).mean() > 0.9
     assert dcmread(out / "on-doppler.dcm").PhotometricInterpretation == "RGB"
     signals = {name: np.load(out / f"{name}-iq.npz") for name in ("on", "off")}
-    assert signals["on"]["iq"].shape == (640, 192) and (signals["on"]["motion_mm"] == 0).all()
+    assert signals["on"]["iq"].shape == (800, 192) and (signals["on"]["motion_mm"] == 0).all()
     # The probe moved away by 30 mm: the tissue is that much deeper.
     assert signals["off"]["motion_mm"][..., 1] == pytest.approx(30.0, abs=1e-3)
 

@@ -255,8 +255,8 @@ def test_a_key_depends_on_the_probe_and_not_on_where_its_file_is(patients, tmp_p
     scene = folder / "scene.toml"
     scene.write_text(scene.read_text().replace('"drop-in"', '"mine.toml"'))
     keys = []
-    for depth in ("40.0", "33.0"):
-        (folder / "mine.toml").write_text(probe.replace("DepthMm = 40.0", f"DepthMm = {depth}"))
+    for depth in ("50.0", "33.0"):
+        (folder / "mine.toml").write_text(probe.replace("DepthMm = 50.0", f"DepthMm = {depth}"))
         assert run([folder], out) == 0
         keys.append(table_in(out)[0]["key"])
     folder = folder.rename(tmp_path / "elsewhere")

@@ -25,7 +25,7 @@ from ultrasound.probe import load_probe
 pytest.importorskip("pymust")
 
 
-@pytest.fixture(scope="module", params=["drop-in", "phased"])
+@pytest.fixture(scope="module", params=["drop-in", "micro", "phased"])
 def phantom(request):
     start("cpu")
     return request.param, EchoPhantom(load_probe(request.param))
@@ -37,14 +37,13 @@ def test_widths_lengths_and_levels_are_within_the_bars_of_simus(phantom, monkeyp
     monkeypatch.setattr(echo_rows, "CYST_POINTS", 10_000)
     monkeypatch.setattr(echo_phantom, "BEATS", 50)
     name, test_object = phantom
-    parts = [lateral_widths]
-    parts += (
-        [edge_width, speckle_statistics, cysts, attenuation, doppler_shifts]
-        if name == "drop-in"
-        else [steered_width]
-    )
-    found = [row for part in parts for row in part(test_object, name)]
-    assert len(found) == (23 if name == "drop-in" else 4)
+    further = {
+        "drop-in": [edge_width],
+        "micro": [edge_width, speckle_statistics, cysts, attenuation, doppler_shifts],
+        "phased": [steered_width],
+    }[name]
+    found = [row for part in (lateral_widths, *further) for row in part(test_object, name)]
+    assert len(found) == (23 if name == "micro" else 4)
     assert [row for row in found if not row.is_within] == []
 
 

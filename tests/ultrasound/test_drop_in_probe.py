@@ -8,6 +8,7 @@ import trimesh
 
 from sim.embedding import Unmoved
 from sim.fields import array_of
+from ultrasound.acoustics import acoustic_values
 from ultrasound.probe import Probe, load_probe
 from ultrasound.probe_manipulator import image_plane, pose_at
 from ultrasound.scanned_anatomy import ScannedAnatomy
@@ -35,11 +36,13 @@ def anatomy() -> ScannedAnatomy:
     return ScannedAnatomy(organ, hu, index_from_mm, labels, tissues, tumour)
 
 
-def scanned(outside: str, gap_mm: float, probe: Probe = PROBE) -> tuple[Scanner, np.ndarray]:
-    """The scanner and its B-mode image, where the face touches the organ over the tumour."""
+def scanned(
+    outside: str, gap_mm: float, probe: Probe = PROBE, above_mm: float = 0.0
+) -> tuple[Scanner, np.ndarray]:
+    """The scanner and its B-mode image, where the face is so far above the organ over the tumour."""
     scanner = Scanner(anatomy(), Unmoved(), probe, PIXELS, outside, contact_gap_mm=gap_mm)
     length = probe.housing_mm[2]
-    pose = pose_at(np.array([0.0, 0.0, ORGAN_MM]), [0, 0, -1.0], [1.0, 0, 0], length)
+    pose = pose_at(np.array([0.0, 0.0, ORGAN_MM + above_mm]), [0, 0, -1.0], [1.0, 0, 0], length)
     plane = image_plane(pose, length, *probe.extent_mm)
     return scanner, scanner.images(plane, probe, "b-mode", "speckle", 350.0, 40.0).by_name[B_MODE]
 
@@ -98,6 +101,14 @@ def test_the_fluid_is_black_and_the_organ_begins_with_a_bright_line(wet):
     organ = (v > surface + 1.5) & (v < surface + 6.0) & (np.abs(u) < 8)
     assert fluid.sum() > 100 and picture[fluid].mean() < 0.1 * picture[organ].mean()
     assert picture[line].max() > 2 * picture[organ].mean()
+
+
+def test_the_highest_layer_is_fluid_from_the_face_on(one_device):
+    sound = scanned("fluid", 10.0, above_mm=9.5)[0].bmode.sound
+    middle = array_of(sound.tissue)[PROBE.number_of_scanlines // 2]
+    depth = array_of(sound.depth)[PROBE.number_of_scanlines // 2]
+    attenuation = middle[: np.argmax(depth > 9.0), 1]
+    assert len(attenuation) > 10 and attenuation == pytest.approx(np.full(len(attenuation), acoustic_values("fluid")[1]))
 
 
 def test_the_same_tissue_is_as_bright_as_under_the_micro_probe(wet):
