@@ -198,7 +198,8 @@ class SurfaceContacts:
         path = (p - start - self.shapes[s].motion(p)).norm()
         bit = 0
         if not self.shapes[s].is_beyond(p, NEAR_MM + path):
-            before, was_near = self.plane[s, q], (self.near[q] >> s) & 1
+            before = self.plane[s, q]
+            touched = (self.near[q] >> s) & 1 and before.xyz.dot(start) < before.w
             query = self.nearest(s, q, p)
             if query.w < NEAR_MM:
                 bit = 1 << s
@@ -206,7 +207,7 @@ class SurfaceContacts:
                 plane = tm.vec4(0.0)
                 if path > DEEP_MM or query.w < -DEEP_MM:
                     plane = self.shapes[s].entered(start, p, DEEP_MM)
-                if was_near and plane.xyz.norm_sqr() == 0.0:
+                if touched and plane.xyz.norm_sqr() == 0.0:
                     plane = self.still_passed(s, self.shapes[s].carried(before), p)
                 if plane.xyz.norm_sqr() > 0.0:
                     self.plane[s, q] = plane
@@ -292,7 +293,9 @@ class SurfaceContacts:
                 normal = plane.xyz
                 shift = p - self.shapes[s].motion(p)
                 depth = plane.w - normal.dot(shift)
-                if depth > 0.0:
+                # A plane that a tool only came near to may be beside the point by now.
+                holds = self.depth(s, q) > 0.0 if ti.static(self.shapes[s].moves) else True
+                if depth > 0.0 and holds:
                     penalty = 1e3 * self.stiffness * self.area[q]
                     stiffness += penalty * normal.outer_product(normal)
                     if has_force:
