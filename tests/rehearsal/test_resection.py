@@ -184,9 +184,9 @@ def touching_at(rehearsal: Rehearsal, target: np.ndarray) -> np.ndarray:
 
 def test_marks_of_the_image_are_a_margin_beside_the_tumour_on_the_capsule(rehearsal):
     anatomy, tumour = rehearsal.anatomy, rehearsal.case.tumour
-    moved_to(rehearsal, touching_at(rehearsal, tumour.center_mass))
+    moved_to(rehearsal, touching_at(rehearsal, tumour.center_mass + np.array([0.0, 0.0, 40.0])))
     with pytest.raises(ResectionError, match="no lateral edge"):
-        # The tumour is wider than the image.
+        # The tumour is beside the image.
         marks_of_image(anatomy, MARGIN_MM)
     moved_to(rehearsal, touching_at(rehearsal, tumour.center_mass + np.array([0.0, 0.0, 12.0])))
     plane = anatomy.image_plane().world_from_plane
