@@ -23,6 +23,10 @@ STUDIES = {
         "studies.robustness.stress_study:stability",
         "Stress-test the tissue and see whether it recovers.",
     ),
+    "hand": (
+        "studies.robustness.hand_study:hand",
+        "Move the probe of SCENE fast and at random, and look at what it does to the organ.",
+    ),
     "soak": ("studies.robustness.soak_study:soak", "Rehearse for an hour in SCENE, faster than real time."),
     "uncertainty": (
         "studies.uncertainty.uncertainty_command:uncertainty",

@@ -68,6 +68,12 @@ def depth_in(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> flo
     return float(np.sqrt(igl.point_mesh_squared_distance(points, vertices, faces)[0].max()))
 
 
+def gap_to(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Distance [mm] from the nearest of points (n, 3) to a surface, vertices (v, 3) [mm]."""
+    faces = np.ascontiguousarray(faces, np.int64)
+    return float(np.sqrt(igl.point_mesh_squared_distance(points, vertices, faces)[0].min()))
+
+
 def measure_contact(
     pose: np.ndarray,
     size_mm: np.ndarray,
