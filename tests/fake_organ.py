@@ -17,6 +17,8 @@ from sim.solver import SolverState, StepSettings
 from sim.surface_contact import ContactLoad
 
 STEP_S = 0.125
+# The transducer gets no lower than this, and where it only touches, no lower than the surface.
+DEEPEST_MM, SURFACE_MM = -50.0, 0.0
 PHANTOM = Scene(anatomy=AnatomyFiles(phantom=True), solver=SolverSection(iterations=4))
 
 
@@ -31,7 +33,8 @@ class FakeOrgan:
         self.young_kpa, self.gravity = 15.0, 9.81
         self.position, self.velocity = np.zeros((2, 3), np.float32), np.ones((2, 3), np.float32)
         self.friction = np.zeros(2, np.float32)
-        self.pose, self.steps, self.notice, self.cut = np.eye(4), 0, "", None
+        self.steps, self.notice, self.cut = 0, "", None
+        self.place(np.eye(4))
         self.model = SimpleNamespace(carrier=SimpleNamespace(interpolation=None))
         self.divergence_check = SimpleNamespace(set_initial_state=self.store_valid_state)
         self.store_valid_state()
@@ -54,15 +57,20 @@ class FakeOrgan:
         body = state.solver.body
         self.position, self.velocity = body.position.copy(), body.velocity.copy()
         self.friction = state.solver.internal_state["friction"].copy()
-        self.divergence, self.pose, self.steps = state.divergence, state.pose, state.steps
+        self.divergence, self.steps = state.divergence, state.steps
+        self.place(state.pose)
 
-    def timed_step(self, pose, length_s, iterations) -> tuple[float, np.ndarray]:
-        good = self.divergence.good.body.position
+    def place(self, pose: np.ndarray) -> None:
+        self.pose = self.hand = pose
+
+    def timed_step(self, hand, length_s, iterations, presses) -> tuple[float, np.ndarray]:
+        good, pose = self.divergence.good.body.position, hand.copy()
+        pose[2, 3] = max(pose[2, 3], DEEPEST_MM if presses else SURFACE_MM)
         push = pose[:3, 3] * iterations + self.young_kpa - self.gravity + 0.1 * good + self.friction[:, None]
         self.velocity = (0.5 * self.velocity + length_s * push).astype(np.float32)
         self.position = (0.9 * self.position + length_s * self.velocity).astype(np.float32)
         self.friction += np.float32(iterations * length_s)
-        self.pose, self.steps = pose, self.steps + 1
+        self.pose, self.hand, self.steps = pose, hand, self.steps + 1
         return 1.0, self.wrench()
 
     def wrench(self) -> np.ndarray:

@@ -113,6 +113,7 @@ def case_of_ball(**changes) -> Case:
         organ=BALL,
         tumour=None,
         parts={},
+        fat_mm=None,
         shapes=(),
         press=Press(direction=-Z, lateral=X),
     )

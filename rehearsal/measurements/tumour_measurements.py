@@ -23,10 +23,6 @@ class Measurement:
     """
     contact_mm2: float
     """Area of the array face in contact."""
-    penetration_mm: float = 0.0
-    """Depth of the array face in the deformed organ, at its centre, edges and corners."""
-    lag_mm: float = 0.0
-    """How far the probe is behind the hand."""
     to_tumour_mm: float | None = None
     """Distance from the array face to the nearest point of the tumour."""
     tumour_depth_mm: float | None = None
@@ -45,6 +41,10 @@ class Measurement:
     """Share of the contact with the probe that slides, by its normal force, 0 to 1."""
     friction_ratio: float | None = None
     """Tangential over normal force on the probe, summed over the contact points."""
+    penetration_mm: float = 0.0
+    """Depth of the array face in the deformed organ, at its centre, edges and corners."""
+    lag_mm: float = 0.0
+    """How far the probe is behind the hand."""
 
 
 def measure(anatomy: DeformedAnatomy, probe: Probe, touches: np.ndarray) -> Measurement:

@@ -211,7 +211,7 @@ class Trial:
             self._step(pose)
 
     def _step(self, pose: np.ndarray) -> None:
-        self._path_mm += self._distance_mm(self.rehearsal.organ.pose, pose)
+        self._path_mm += self._distance_mm(self.rehearsal.organ.hand, pose)
         self.rehearsal.advance(pose)
         self._was_restored |= bool(self.rehearsal.organ.notice)
         self._steps_taken += 1

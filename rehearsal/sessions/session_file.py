@@ -38,9 +38,8 @@ from text_files import TextError, json_value
 
 # Times are sums of steps.
 ROUNDING_S = 1e-9
-# The format of a session's file. The first had events between the poses of seconds; in the third the probe
-# was where the hand asked for it.
-SESSION_FORMAT = 4
+# The format of a session's file. The first had events between the poses of seconds.
+SESSION_FORMAT = 3
 MOST_FILE_BYTES = 2_000_000_000
 # The parts of a scene that belong to the patient's folder and may name files.
 PATIENTS: dict[str, Any] = {

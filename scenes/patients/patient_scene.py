@@ -96,7 +96,7 @@ def fat_row(patient: Patient, scene: Scene) -> tuple[str, str]:
     around = f", and {attachment.freed_margin_mm:g} mm around the tumour" if patient.tumour else ""
     return (
         "fat",
-        f"{attachment.fat_young_kpa:g} kPa{thick}; removed from {freed:.0f} % of the surface: towards the "
+        f"{attachment.fat_young_kpa:g} kPa{thick}; none on {freed:.0f} % of the surface, freed: towards the "
         f"probe{around}; {hidden:.0f} % not shown by the CT: {attachment.fat_kpa_mm:g} kPa/mm there",
     )
 

@@ -84,7 +84,7 @@ def test_what_a_session_holds_is_recalled_as_it_was_measured(measurements, anato
     )
     moves = [(number, Move(pose=pose, length_s=MEASURE_S)) for number, pose in enumerate(FIRST)]
     header = Header(anatomy="", scene={}, probe={}, arch="cpu", time_step_s=0.02)
-    log = Log(header, [*moves, (4, Undo())])
+    log = Log(header, [*moves, (4, Undo())], dict(enumerate(FIRST)))
     measurements.note = log.readings.__setitem__
     observed(measurements, *FIRST)
     measurements.observe(undone(4, 4 * MEASURE_S), PROBE)

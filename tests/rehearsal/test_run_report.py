@@ -12,6 +12,7 @@ from rehearsal.build_solver import step_settings
 from rehearsal.configuration import probe_of
 from rehearsal.loop.command import Undo
 from rehearsal.loop.frame import Applied, Event, Frame, Step
+from rehearsal.measurements import run_report
 from rehearsal.measurements.run_report import Tally, summary
 from scenes.scene import EMBEDDED, load_scene
 from sim.material import Material, Part
@@ -29,11 +30,12 @@ def rehearsed(
         organ=SimpleNamespace(
             settings=step_settings(SCENE.tissue, SCENE.solver),
             model=SimpleNamespace(counts=lambda: dict(particles=4, nodes=4, cells=1)),
-            contacts=SimpleNamespace(measure_penetration=lambda: penetration_mm),
             parts_of_tissue=[Part("tumour", None, Material(60.0, 0.4))],
             steps=2,
         ),
-        anatomy=SimpleNamespace(embedding=SimpleNamespace(count=6), volume_ratio=lambda: volume),
+        anatomy=SimpleNamespace(
+            embedding=SimpleNamespace(count=6), volume_ratio=lambda: volume, penetration_mm=penetration_mm
+        ),
         indentation_mm=lambda: indentation_mm,
         frame=SimpleNamespace(wrench=WRENCH / 2, sliding_share=share, friction_ratio=0.25),
     )
@@ -43,14 +45,17 @@ def frame_of(wrench: np.ndarray, *events: Event, last_mm: float = 0.0) -> Frame:
     """The tissue is four points, the last of which may be lost."""
     positions = np.zeros((4, 3))
     positions[3, 1] = last_mm
-    return replace(frame_at(np.eye(4), 1, 0.0, *events), positions=positions, wrench=wrench)
+    hand = np.eye(4)
+    hand[0, 3] = 3.0
+    return replace(frame_at(np.eye(4), 1, 0.0, *events), hand=hand, positions=positions, wrench=wrench)
 
 
 STEP = Step(0, np.eye(4), np.eye(4), 0.01, 4, 1.0)
 
 
 @pytest.mark.parametrize("lost", [None, np.nan, np.inf])
-def test_figures_are_those_of_tissue_that_is_there(lost):
+def test_figures_are_those_of_tissue_that_is_there(lost, monkeypatch):
+    monkeypatch.setattr(run_report, "penetration_of", lambda anatomy: anatomy.penetration_mm)
     tally, later = Tally(1.0), rehearsed(0.99, 0.1, 1.5)
     tally.add(rehearsed(0.97, 0.25, 3.5), frame_of(WRENCH, STEP))
     tally.add(later, frame_of(WRENCH / 2, STEP))
@@ -62,6 +67,7 @@ def test_figures_are_those_of_tissue_that_is_there(lost):
         tally.add(rehearsed(lost, 0.0, lost), frame_of(WRENCH, STEP, last_mm=lost))
     report = tally.report(later, "cpu")
     json.dumps(report, allow_nan=False)
+    assert report["max_lag_mm"] == 3.0 and report["penetration_mm"] == (0.1 if lost is None else None)
     names = "volume_ratio_min", "max_penetration_mm", "indentation_max_mm"
     assert [report[name] for name in names] == ([0.97, 0.25, 3.5] if lost is None else [None] * 3)
     assert report["force_max_n"] == (0.5 if lost is None else None)
@@ -77,7 +83,7 @@ def test_figures_are_those_of_tissue_that_is_there(lost):
     (press,) = (line for line in summary(report).splitlines() if line.startswith("press"))
     figures = (
         "indentation 3.50 mm at most, force 0.50 N at most; least volume 97.0 %; "
-        "penetration at most 0.250 mm; all finite"
+        "penetration at most 0.250 mm; all finite; the probe at most 3.0 mm behind the hand"
     )
     slipped = summary(tally.report(rehearsed(0.99, 0.1, 1.5, share=0.75), "cpu"))
     assert ("force 0.50 N at most, 75 % of the contact slides;" in slipped) == (lost is None)

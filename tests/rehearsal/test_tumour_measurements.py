@@ -32,12 +32,12 @@ def anatomy_of(
     """
     organ = organ or ball(30.0)
     return SimpleNamespace(
-        case=SimpleNamespace(size_mm=np.array(probe.housing_mm)),
+        case=SimpleNamespace(size_mm=np.array(probe.housing_mm), probe=probe),
         organ=organ,
         vertices=np.asarray(organ.vertices if now is None else now, float),
         pose=posed() if pose is None else pose,
         tumour=tumour,
-        frame=SimpleNamespace(**{"wrench": None, **load}),
+        frame=SimpleNamespace(**{"wrench": None, "lag_mm": 0.0, **load}),
         tumour_vertices=None if tumour is None else np.asarray(tumour.vertices) + shift,
         tumour_outline=lambda: None if tumour is None else outline,
     )

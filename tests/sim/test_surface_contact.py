@@ -2,6 +2,8 @@
 step.
 """
 
+from typing import Any
+
 import numpy as np
 import pytest
 import taichi as ti
@@ -192,14 +194,15 @@ def ask(contacts: ti.template(), pushed: ti.template(), held: ti.template(), at:
                 held[q][1 + row, column] = stiffness[row, column]
 
 
-def layer_of(contacts, s: int, x: np.ndarray, shifted: np.ndarray, slid: np.ndarray):
+def layer_of(contacts, s: int, x: np.ndarray, shifted: np.ndarray, slid: np.ndarray, holds: Any = True):
     """Force (p, 3) [uN] and stiffness (p, 3, 3) of shape s on points at x (p, 3) in float64, where its planes
-    have moved by ``shifted`` and the points have slid by ``slid`` (p, 3); which points touch, and which of
-    them slide.
+    have moved by ``shifted`` and the points have slid by ``slid`` (p, 3), of those whose plane ``holds``
+    (p,); which points touch, and which of them slide.
     """
     plane, near = array_of(contacts.plane)[s].astype(float), (array_of(contacts.near) >> s & 1) == 1
     normal, slip = plane[:, :3], array_of(contacts.slip)[s].astype(float) + slid
     depth = np.where(near, np.maximum(plane[:, 3] - ((x - shifted) * normal).sum(axis=1), 0.0), 0.0)
+    depth = np.where(holds, depth, 0.0)
     slip -= (slip * normal).sum(axis=1, keepdims=True) * normal
     share = np.minimum(
         FRICTION * depth / TANGENTIAL_RATIO / np.maximum(np.linalg.norm(slip, axis=1), 1e-12), 1.0
@@ -228,7 +231,12 @@ def test_forces_and_stiffnesses_are_those_of_the_penalty_law(kept, dome):
     # Rounding of 1e-6 mm is a few thousandths of a percent of the deepest, and of the largest slip.
     pushed, held = (array_of(field).astype(float) for field in (pushed, held))
     ways = np.zeros(3), motion
-    laws = [layer_of(contacts, s, places, way, places - known - way) for s, way in enumerate(ways)]
+    # A rigid correction counts on the planes of a tool that were touched.
+    before = layer_of(contacts, 1, known, np.zeros(3), np.zeros_like(known))[2]
+    laws = [
+        layer_of(contacts, s, places, way, places - known - way, holds)
+        for s, (way, holds) in enumerate(zip(ways, (True, before), strict=True))
+    ]
     assert all(law[2].sum() > 5 for law in laws) and 3 < sum(law[3].sum() for law in laws) < 100
     wanted = np.concatenate([sum(law[0] for law in laws)[:, None], sum(law[1] for law in laws)], axis=1)
     assert (np.abs(held - wanted).max(axis=(0, 2)) < 1e-3 * np.abs(wanted).max(axis=(0, 2))).all()

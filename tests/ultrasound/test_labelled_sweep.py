@@ -253,6 +253,7 @@ def still_rehearsal() -> tuple[SimpleNamespace, list[np.ndarray]]:
     """What the correction asks of a rehearsal whose tissue never moves, and the poses of its probe."""
     probe = load_probe("curvilinear").model_copy(update=dict(housing_mm=(40.0, 10.0, 20.0)))
     organ = SimpleNamespace(pose=np.eye(4), settings=SimpleNamespace(time_step_s=1 / 60))
+    organ.place = lambda pose: setattr(organ, "pose", pose)
     poses: list[np.ndarray] = []
 
     def advance(pose: np.ndarray) -> None:
