@@ -203,15 +203,14 @@ class SurfaceContacts:
             query = self.nearest(s, q, p)
             if query.w < NEAR_MM:
                 bit = 1 << s
-            if query.w < -DEEP_MM or query.w > 0.0:
-                plane = tm.vec4(0.0)
-                if path > DEEP_MM or query.w < -DEEP_MM:
-                    plane = self.shapes[s].entered(start, p, DEEP_MM)
-                if touched and plane.xyz.norm_sqr() == 0.0:
-                    plane = self.still_passed(s, self.shapes[s].carried(before), p)
-                if plane.xyz.norm_sqr() > 0.0:
-                    self.plane[s, q] = plane
-                    bit = 1 << s
+            plane = tm.vec4(0.0)
+            if path > DEEP_MM:
+                plane = self.shapes[s].entered(start, p, DEEP_MM)
+            if touched and plane.xyz.norm_sqr() == 0.0:
+                plane = self.still_passed(s, self.shapes[s].carried(before), p)
+            if plane.xyz.norm_sqr() > 0.0:
+                self.plane[s, q] = plane
+                bit = 1 << s
         return bit
 
     @ti.func

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from fake_organ import STEP_S, fake_timeline
+from fake_organ import DEEPEST_MM, STEP_S, SURFACE_MM, fake_timeline, pose_at
 from recorded_session import LiveSession, header, record_all
 from settings_at_start import settings_with
 
 import app
 from rehearsal.configuration import probe_of
-from rehearsal.loop.command import CutOut, GoTo, Move, Undo
+from rehearsal.loop.command import CutOut, GoTo, Move, NewSession, Undo
 from rehearsal.notices import Notices
 from rehearsal.sessions.packed_arrays import (
     StateError,
@@ -429,3 +429,27 @@ def test_what_a_session_says_of_a_patient_or_of_files_is_not_believed(tmp_path, 
     scene = scene_of_log(recorded.model_copy(update=dict(scene=recorded.scene | planted)), own)
     assert (scene.anatomy, scene.shape, scene.title) == (own.anatomy, own.shape, own.title)
     assert scene.transducer.probe == own.transducer.probe and scene.transducer.speed_mm_s == 33.0
+
+
+def test_what_the_probe_did_is_recorded_beside_what_the_hand_asked(tmp_path):
+    path = tmp_path / "session.jsonl"
+    live = LiveSession(path)
+    asked = [(pose_at(1.0, z=z), presses) for z, presses in ((2.0, True), (-3.0, False), (-99.0, True))]
+    live.do(*(Move(pose=pose, presses=presses) for pose, presses in asked))
+    live.recorder.close({})
+    log = read_log(path)
+    moves = [command for _, command in log.commands]
+    assert [(move.pose[2, 3], move.presses) for move in moves] == [(2.0, True), (-3.0, False), (-99.0, True)]
+    assert [log.poses[number][2, 3] for number in range(3)] == [2.0, SURFACE_MM, DEEPEST_MM]
+    # The replay moves the hand, and so gets the same states.
+    again = fake_timeline()
+    again.submit(NewSession(pose=np.eye(4)))
+    for move in moves:
+        again.submit(move)
+    assert again.organ.digest() == live.stepper.organ.digest()
+    # Where the probe follows and presses, the hand's poses say all.
+    plain = LiveSession(tmp_path / "plain.jsonl")
+    plain.do(Move(pose=pose_at(1.0)))
+    plain.recorder.close({})
+    assert not {'"probe":"', '"presses":'} & set((tmp_path / "plain.jsonl").read_text().split(","))
+    assert (read_log(tmp_path / "plain.jsonl").poses[0] == pose_at(1.0)).all()

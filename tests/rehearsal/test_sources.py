@@ -222,3 +222,31 @@ def test_a_scripted_press_makes_a_move_for_each_of_its_steps():
             user.stepper.submit(command)
     frame = user.stepper.newest()
     assert len(frame.steps) == 4 and np.allclose(frame.pose, advanced(home, 4.0))
+
+
+def test_the_depth_of_a_key_goes_back_when_the_mouse_moves_on():
+    user = UserAtBall()
+    touching = user.step(ray=ray(0.0))[2, 3]
+    for _ in range(6):
+        user.step(ray=ray(0.0), push_mm=0.5)
+    pushed = user.step(ray=ray(0.0))
+    assert pushed[2, 3] == pytest.approx(touching - 3.0, abs=1e-6)
+    assert user.commands[-1].presses
+    # A tremor of the hand is no move.
+    for _ in range(4):
+        user.step(ray=ray(0.5))
+    assert user.manipulator.state.depth_mm == 3.0
+    for _ in range(4):
+        user.step(ray=ray(-5.0))
+    assert user.manipulator.state.depth_mm == 0.0 and not user.commands[-1].presses
+
+
+def test_a_mouse_that_only_points_asks_to_touch_and_a_button_or_a_tracker_to_press():
+    user = UserAtBall()
+    user.step(ray=ray(4.0))
+    assert not user.commands[-1].presses
+    user.step(ray=ray(4.0), press=True)
+    assert user.commands[-1].presses
+    tracked = UserAtBall(tracked=lambda time_s: np.eye(4))
+    tracked.step()
+    assert tracked.commands[-1].presses

@@ -420,3 +420,43 @@ def test_the_wrench_is_the_sum_of_the_forces_on_the_points(one_device, block):
         solver.step(settings_of(8, gravity=(0.0, 0.0, -G)))
     total = contacts.load(tool, about).wrench[:3] + contacts.load(floor, about).wrench[:3]
     assert total == pytest.approx([0, 0, -1e-6 * weight(solver)], abs=0.01 * wanted[2])
+
+
+def planes_of_tool(solver) -> tuple[np.ndarray, np.ndarray]:
+    """Normals (p, 3) of the tool's planes at the points, and which of these are near it."""
+    near = (array_of(solver.contacts.near) >> 1 & 1).astype(bool)
+    return array_of(solver.contacts.plane)[1, :, :3].astype(float), near
+
+
+@pytest.mark.parametrize("thick_mm, to_mm", [(20.0, 4.0), (4.0, 4.0), (2.0, 7.0)])
+def test_a_point_that_a_tool_passes_is_pushed_out_by_the_side_that_it_came_by(kept, block, thick_mm, to_mm):
+    """Deep in a tool, or behind a thin one that has jumped over it in one substep."""
+    tool = ConvexTool.cuboid(np.array([40.0, 40.0, thick_mm]))
+    solver = tissue_of(block, 4.0, [Plane(UP, -8.0), tool], 0.0)
+    above = lifted(8.0 + thick_mm / 2 + 0.5)
+    solver.step(settings_of(1), np.array([above, above]))
+    top = array_of(solver.contacts.point)[:, 2] > 7.5
+    jumped = above.copy()
+    jumped[2, 3] -= 0.5 + to_mm
+    solver.step(settings_of(1), np.array([above, jumped]))
+    for _ in range(3):
+        normal, near = planes_of_tool(solver)
+        assert near[top].all() and (normal[top] @ UP < -0.99).all()
+        solver.step(settings_of(1), np.array([jumped, jumped]))
+    # In the end all of the top is under the face.
+    rest(solver, 60, settings_of(20), np.array([jumped, jumped]))
+    face = jumped[2, 3] - thick_mm / 2
+    assert array_of(solver.contacts.point)[top, 2].max() < face + 0.3
+
+
+def test_a_point_beside_the_path_of_a_tool_is_not_pushed(kept, block):
+    """The tool comes near from the side and slides over it: its side's plane does not hold any more."""
+    tool = ConvexTool.cuboid(np.array([20.0, 20.0, 10.0]), 1.0)
+    solver = tissue_of(block, 4.0, [Plane(UP, -8.0), tool], FRICTION)
+    before = position(solver)
+    for n in range(20):
+        poses = np.stack([lifted(13.02), lifted(13.02)])
+        poses[:, 0, 3] = -40 + 2.5 * n, -40 + 2.5 * (n + 1)
+        solver.step(settings_of(4), poses)
+        # It is 0.02 mm above, and never touches.
+        assert np.abs(position(solver) - before).max() < 1e-3

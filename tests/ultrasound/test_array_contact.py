@@ -5,7 +5,8 @@ import pytest
 import trimesh
 from conftest import rotation_about
 
-from ultrasound.array_contact import CONTACT_MM, face_points, measure_contact
+from ultrasound.array_contact import CONTACT_MM, depth_in, face_points, footprint, gap_to, measure_contact
+from ultrasound.probe import load_probe
 
 # 20 x 10 places of 0.75 x 0.75 mm.
 SIZE = np.array([15.0, 7.5, 20.0])
@@ -153,3 +154,28 @@ def test_moving_all_changes_nothing(ball, block, seed):
         assert still.area_mm2 > 5
         assert moved.area_mm2 == pytest.approx(still.area_mm2)
         assert moved.compression_mm == pytest.approx(still.compression_mm, abs=1e-9)
+
+
+def test_the_footprint_is_on_the_rounded_face():
+    probe = load_probe("drop-in")
+    half, rounded = np.array(probe.housing_mm) / 2, probe.edge_radius_mm
+    points = footprint(probe)
+    q = np.abs(points) - (half - rounded)
+    distance = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0) - rounded
+    assert np.abs(distance).max() < 1e-9
+    # Centre, edges and corners: a corner is a third of the way round.
+    assert np.abs(points - [0, 0, -half[2]]).sum(axis=1).min() == 0
+    corner = half - rounded * (1 - 1 / np.sqrt(3))
+    assert np.abs(points - corner * [1, -1, -1]).sum(axis=1).min() < 1e-9
+    sharp = footprint(load_probe("linear"))
+    assert (sharp[:, 2] == -10).all() and np.ptp(sharp, axis=0) == pytest.approx([40, 10, 0])
+
+
+def test_depth_in_a_surface_is_the_distance_from_inside():
+    ball = trimesh.creation.icosphere(5, 20.0)
+    places = np.array([[0, 0, 25.0], [0, 0, 19.0], [0, 0, 13.5], [0, 30.0, 0]])
+    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+    # The facets of the sphere are up to 0.01 mm inside of it.
+    assert depth_in(places, vertices, faces) == pytest.approx(6.5, abs=0.02)
+    assert depth_in(places[[0, 3]], vertices, faces) == 0.0
+    assert gap_to(places[[0, 3]], vertices, faces) == pytest.approx(5.0, abs=0.02)
