@@ -3,12 +3,14 @@ that only looks: penetration, coupling, force, and whether the organ comes back.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rehearsal.configuration import PRESETS, Setup, scene_of
+from rehearsal.live_settings import initial_settings
 from rehearsal.measurements.tumour_measurements import penetration_of
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sources.user import Hand
@@ -139,11 +141,12 @@ def random_hand(rehearsal: Rehearsal, length_s: float) -> Iterator[tuple[np.ndar
     random, step_s = np.random.default_rng(SEED), rehearsal.case.scene.solver.time_step_s
     manipulator = rehearsal.manipulator
     user, pose = Hand(manipulator), rehearsal.organ.pose
-    left_s, kind, controls = 0.0, "mouse", Controls(None)
+    still = Controls(initial_settings(rehearsal.case))
+    left_s, kind, controls = 0.0, "mouse", still
     for _ in range(max(1, round(length_s / step_s))):
         if left_s <= 0.0:
             left_s, kind = random.uniform(LEAST_S, LONGEST_S), str(random.choice(KINDS, p=SHARES))
-            controls = _controls(rehearsal, random, kind, step_s)
+            controls = replace(still, **_act(rehearsal, random, kind, step_s))
             if kind == "tracker":
                 pose = _jump(pose, random)
                 manipulator.match(pose)
@@ -153,18 +156,20 @@ def random_hand(rehearsal: Rehearsal, length_s: float) -> Iterator[tuple[np.ndar
         yield pose, kind == "tracker" or manipulator.state.presses
 
 
-def _controls(rehearsal: Rehearsal, random: np.random.Generator, kind: str, step_s: float) -> Controls:
-    """What a mouse or keys do in a step: a place over the organ, pressed or not; or pushes, slides, turns."""
+def _act(rehearsal: Rehearsal, random: np.random.Generator, kind: str, step_s: float) -> dict[str, Any]:
+    """What a mouse or keys do in a step, as in ``Controls``: a place over the organ, pressed or not; or
+    pushes, slides and turns.
+    """
     if kind == "mouse":
         manipulator = rehearsal.manipulator
         goal = manipulator.vertices[random.integers(len(manipulator.vertices))]
         outward = manipulator.surface_normal(goal)
         ray = goal + 50 * outward, -outward
-        return Controls(None, ray=ray, press=bool(random.random() < 0.7))
+        return dict(ray=ray, press=bool(random.random() < 0.7))
     push, *slide = random.uniform(-1, 1, 3) * KEY_MM_S * step_s
     tilt, rock, rotate = random.uniform(-1, 1, 3) * KEY_DEG_S * step_s
     turns = dict(tilt_deg=tilt, rock_deg=rock, rotate_deg=rotate)
-    return Controls(None, push_mm=push, slide_mm=(slide[0], slide[1]), **turns)
+    return dict(push_mm=push, slide_mm=(slide[0], slide[1])) | turns
 
 
 def _jump(pose: np.ndarray, random: np.random.Generator) -> np.ndarray:
