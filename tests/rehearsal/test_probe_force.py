@@ -11,7 +11,7 @@ from rehearsal.case import case_of
 from rehearsal.loop.command import Move
 from rehearsal.loop.frame import Step
 from rehearsal.notices import Notices
-from rehearsal.pressed_organ import PressedOrgan
+from rehearsal.pressed_organ import COUPLING_N_MM, MOST_PENETRATION_MM, PressedOrgan, within_force
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.packed_arrays import unpack_wrenches
 from rehearsal.sessions.recorder import SessionRecorder, header_of
@@ -83,3 +83,42 @@ def test_the_sessions_file_has_the_force_of_every_step(rehearsal, tmp_path):
     lines = [json.loads(line) for line in recorder.path.read_text("utf-8").splitlines()]
     found = np.concatenate([unpack_wrenches(line["wrenches"]) for line in lines if "wrenches" in line])
     assert (found == np.array([step.wrench for step in steps], np.float32)).all()
+
+
+def test_the_probe_presses_with_no_more_than_the_limit_however_deep_the_hand_goes(one_device):
+    anatomy, limit_n = small_anatomy(), 1.0
+    scene = with_options(briefly(60), {"tissue.cell_mm": 4.0, "transducer.force_limit_n": limit_n})
+    rehearsal = Rehearsal(case_of(scene, anatomy), anatomy)
+    steps = pressed(rehearsal, 8.0, 60)
+    held = rehearsal.do(*[Move(pose=rehearsal.pose_at_depth(8.0))] * 60).steps
+    force_n = [float(np.linalg.norm(step.wrench[:3])) for step in steps + held]
+    # A step moves on by at most a fifth of a millimetre for each newton that is left.
+    assert max(force_n) < 1.1 * limit_n and force_n[-1] == pytest.approx(limit_n, rel=0.02)
+    assert rehearsal.frame.lag_mm > 1.0
+    # With the hand it comes out again.
+    out = pressed(rehearsal, -2.0, 30)[-1]
+    assert (out.wrench == 0).all() and (out.pose == out.hand).all()
+
+
+def test_a_goal_is_moved_by_what_the_force_has_left():
+    pose, goal = np.eye(4), np.eye(4)
+    goal[:3, 3] = 0.5, 0.0, -3.0
+    free = within_force(pose, goal, np.zeros(3), 10.0)
+    assert free is goal and within_force(pose, goal, np.array([0, 0, 0.1]), 100.0) is goal
+    # 2 N are left of 10 N: 0.4 mm against the force; the rest of the motion stays.
+    near = within_force(pose, goal, np.array([0, 0, 8.0]), 10.0)
+    assert near[:3, 3] == pytest.approx([0.5, 0.0, -2 / COUPLING_N_MM])
+    # Beyond the limit it retreats, at most by what a step may move in.
+    over = within_force(pose, pose, np.array([0, 0, 12.0]), 10.0)
+    assert over[:3, 3] == pytest.approx([0, 0, 2 / COUPLING_N_MM])
+    far = within_force(pose, pose, np.array([0, 0, 99.0]), 10.0)
+    assert far[:3, 3] == pytest.approx([0, 0, MOST_PENETRATION_MM])
+    assert (pose == np.eye(4)).all()
+
+
+def test_a_hand_that_only_touches_presses_nothing(rehearsal):
+    rest = rehearsal.anatomy.vertices
+    for _ in range(20):
+        frame = rehearsal.do(Move(pose=rehearsal.pose_at_depth(8.0), presses=False))
+    assert np.linalg.norm(frame.wrench[:3]) < 0.2
+    assert np.abs(rehearsal.anatomy.vertices - rest).max() < 0.3
