@@ -41,6 +41,9 @@ from ultrasound.probe_manipulator import advanced, array_face_centre, poses_betw
 AWAY_MM = 200.0
 # How deep the probe may move into the tissue in a step, before the tissue yields.
 MOST_PENETRATION_MM = 0.8
+# Round tissue the proxy's path is bent. Of a longer one the solver, for which a path is straight, has the end
+# alone.
+MOST_STRAIGHT_MM = 3.0
 # Force of a probe that only touches.
 TOUCH_N = 0.1
 # Stiffness of the virtual coupling of hand and probe: the nearer the force is to its limit, the less the
@@ -214,7 +217,9 @@ class PressedOrgan:
         ``notice`` is the message of the divergence check if it restored the state, else empty.
         """
         pose = self._proxy_of(hand, presses)
-        self.solver.step(self.settings, poses_between(self.pose, pose, self.settings.substeps))
+        is_bent = pose is not hand and np.linalg.norm(pose[:3, 3] - self.pose[:3, 3]) > MOST_STRAIGHT_MM
+        path = poses_between(pose if is_bent else self.pose, pose, self.settings.substeps)
+        self.solver.step(self.settings, path)
         self.notice = self.divergence_check.check(self.settings.time_step_s)
         self.pose, self.hand = pose, hand
         self.steps += 1

@@ -32,7 +32,7 @@ REUSE_MM = 0.15
 NEAR_MM = 3.0
 # A point deeper in a tool than this, or that passes one on a longer path, leaves it by the side that it came
 # by: the nearest side may be another one.
-DEEP_MM = 0.5
+DEEP_MM = 1.0
 # Forces are summed in blocks of this many points, in an order that does not depend on threads.
 BLOCK = 64
 # Distance around a static shape within which the distance to it must be known [mm].
@@ -196,17 +196,17 @@ class SurfaceContacts:
         where it is near.
         """
         path = (p - start - self.shapes[s].motion(p)).norm()
-        bit = 0
-        if not self.shapes[s].is_beyond(p, NEAR_MM + path):
-            before = self.plane[s, q]
-            touched = (self.near[q] >> s) & 1 and before.xyz.dot(start) < before.w
+        before, depth, bit = self.plane[s, q], 0.0, 0
+        if (self.near[q] >> s) & 1:
+            depth = ti.max(before.w - before.xyz.dot(start), 0.0)
+        if not self.shapes[s].is_beyond(p, NEAR_MM + path + depth):
             query = self.nearest(s, q, p)
             if query.w < NEAR_MM:
                 bit = 1 << s
             plane = tm.vec4(0.0)
             if path > DEEP_MM:
                 plane = self.shapes[s].entered(start, p, DEEP_MM)
-            if touched and plane.xyz.norm_sqr() == 0.0:
+            if depth > 0.0 and plane.xyz.norm_sqr() == 0.0:
                 plane = self.still_passed(s, self.shapes[s].carried(before), p)
             if plane.xyz.norm_sqr() > 0.0:
                 self.plane[s, q] = plane

@@ -24,7 +24,7 @@ def test_a_random_hand_is_measured_and_leaves_the_organ_where_it_was(tmp_path, m
     with (tmp_path / "hand.csv").open(newline="", encoding="utf-8") as file:
         assert len(list(csv.DictReader(file))) == 1
     assert run["steps"] == 120 and run["finite"] and run["coupled_apart"] == 0
-    assert 0 < run["penetration_mm"] < 3 and run["force_n"] > 0.5 and run["lag_mm"] > 5
+    assert 0 < run["penetration_mm"] < 10 and run["force_n"] > 0.5 and run["lag_mm"] > 5
     assert run["look_force_n"] <= 0.2 and run["look_shift_mm"] <= 0.3
     assert "fast" in capsys.readouterr().out
 
