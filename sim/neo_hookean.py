@@ -79,7 +79,7 @@ class NeoHookean:
         if inputs.shapes:
             spacing_mm = POINT_SPACING_CELLS * tissue.cell_mm
             points, area_mm2 = stored(surface_points, inputs.organ, spacing_mm)
-            # What the organ lies on is behind its fat, which holds it instead of friction.
+            # Between organ and support is its fat, whose stiffness takes the place of friction.
             in_fat = any(isinstance(tether, PerirenalFat) for tether in inputs.tethers)
             surface = points, area_mm2, inputs.shapes
             contacts = SurfaceContacts(body, lattice, *surface, inputs.friction, support_is_smooth=in_fat)

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from sim.fields import array_of, fill, zeros
 from sim.kernels import kernel
+from sim.linear_algebra import rotation_by
 from sim.shapes import FAR, ConvexTool
 
 # No point of a tool moves further than this between two tests of contact: less than half of the thinnest
@@ -146,12 +147,3 @@ class Proxy:
                         nearest, place = tm.vec4(surface.xyz, surface.w - point.w), local
                         place.z += point.w
         return nearest, place
-
-
-@ti.func
-def rotation_by(turn):
-    """The matrix (3, 3) of a rotation vector [rad] (Rodrigues)."""
-    angle = turn.norm()
-    axis = turn / ti.max(angle, 1e-12)
-    across = tm.mat3(0.0, -axis.z, axis.y, axis.z, 0.0, -axis.x, -axis.y, axis.x, 0.0)
-    return tm.eye(3) + ti.sin(angle) * across + (1.0 - ti.cos(angle)) * across @ across
