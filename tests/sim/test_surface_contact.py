@@ -9,6 +9,7 @@ import pytest
 import taichi as ti
 import trimesh
 from lattice_tissue import DENSITY, YOUNG_KPA, G, jacobians, lifted, position, put, settings_of, tissue_of
+from scipy.spatial.transform import Rotation
 
 from sim.body import BodyState
 from sim.fields import array_of, fill, zeros
@@ -460,3 +461,58 @@ def test_a_point_beside_the_path_of_a_tool_is_not_pushed(kept, block):
         solver.step(settings_of(4), poses)
         # It is 0.02 mm above, and never touches.
         assert np.abs(position(solver) - before).max() < 1e-3
+
+
+@kernel
+def cross(
+    tool: ti.template(), start: ti.template(), end: ti.template(), side: ti.template(), moved: ti.template()
+):
+    """The side by which each point enters a tool on its path, and planes moved with the tool."""
+    for i in range(start.shape[0]):
+        side[i] = tool.entered(start[i], end[i], 0.2)
+        moved[i] = tool.carried(moved[i])
+
+
+def test_the_side_of_entry_is_the_first_that_the_path_crosses_and_planes_move_with_the_tool(one_device):
+    """Against 4000 places along each path, in the frame of a tool that moves and turns meanwhile."""
+    half, rng, count = np.array([10.0, 6.0, 4.0]), np.random.default_rng(3), 300
+    tool = ConvexTool.cuboid(2 * half)
+    before, now = lifted(3.0), lifted(1.0)
+    before[:3, :3] = Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix()
+    now[:3, :3] = Rotation.from_rotvec([0.25, -0.1, 0.2]).as_matrix()
+    now[:3, 3] += [0.7, -0.4, 0.2]
+    tool.move(before, now)
+    start, end = rng.uniform(-16, 16, (2, count, 3))
+    normal = rng.normal(size=(count, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    planes = np.column_stack([normal, rng.uniform(-5, 5, count)])
+    fields = [zeros(count, n, within=1) for n in (3, 3, 4, 4)]
+    fill(*zip(fields, (start, end, np.zeros((count, 4)), planes), strict=True))
+    cross(tool, *fields)
+    side, moved = (array_of(field).astype(float) for field in fields[2:])
+    # A point of the plane, carried from the pose before to that now, is on the plane that was carried.
+    on_plane = np.column_stack([planes[:, 3:] * normal, np.ones(count)])
+    carried = (on_plane @ (now @ np.linalg.inv(before)).T)[:, :3]
+    assert np.abs((moved[:, :3] * carried).sum(axis=1) - moved[:, 3]).max() < 1e-4
+    # The start as it is for the tool at its end.
+    back = before @ np.linalg.inv(now) - np.eye(4)
+    shifted = start - (np.column_stack([end, np.ones(count)]) @ back.T)[:, :3]
+    local = [(x - now[:3, 3]) @ now[:3, :3] for x in (shifted, end)]
+    share = np.linspace(0, 1, 4001)[:, None]
+    entered = 0
+    for i in range(count):
+        path = local[0][i] + share * (local[1][i] - local[0][i])
+        depth = (half - np.abs(path)).min(axis=1)
+        if depth[0] > 0 or 0.1 < depth.max() < 0.5:
+            continue
+        if depth.max() <= 0.1:
+            assert (side[i] == 0).all()
+            continue
+        entered += 1
+        first = int(np.argmax(depth > 0))
+        axis = int(np.argmax(np.abs(path[first - 1]) - half))
+        wanted = np.sign(path[first, axis]) * now[:3, axis]
+        assert side[i, :3] == pytest.approx(wanted, abs=1e-5)
+        # The plane is the tool's side.
+        assert side[i, 3] == pytest.approx(wanted @ now[:3, 3] + half[axis], abs=1e-4)
+    assert entered > 60
