@@ -40,7 +40,7 @@ from ultrasound.probe_manipulator import advanced, array_face_centre, poses_betw
 
 AWAY_MM = 200.0
 # How deep the probe may move into the tissue in a step, before the tissue yields.
-MOST_PENETRATION_MM = 0.8
+MOST_PENETRATION_MM = 0.7
 # Round tissue the proxy's path is bent. Of a longer one the solver, for which a path is straight, has the end
 # alone.
 MOST_STRAIGHT_MM = 3.0
@@ -104,7 +104,7 @@ class PressedOrgan:
             parts=self.parts_of_tissue,
         )
         self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
-        self.proxy = Proxy(self.contacts, self.tool)
+        self.proxy = Proxy(self.contacts.proxy_points, self.tool)
         self.settings = step_settings(tissue, section)
         self.young_kpa: float | None = getattr(tissue, "young_kpa", None)
         self._set_gravity(case.scene.gravity)

@@ -26,12 +26,14 @@ from sim.fields import Field, field_of, fields_of, fill, zeros
 from sim.lattice import CORNERS, Lattice, fill_with_cells, surface_points
 from sim.linear_algebra import cross, four, row, solve
 from sim.material import Material, mixture
+from sim.penetration_barrier import BARRIER_SPACING_MM, PenetrationBarrier
 from sim.removed_tissue import RemovedTissue, lattice_without, patch_shares, points_without
 from sim.rigid_correction import RigidCorrection
 from sim.skinning import NodeCarrier
 from sim.solver import StepSettings
 from sim.stored_arrays import stored
 from sim.surface_contact import PENALTY_DEPTH_MM, REACH_MM, SurfaceContacts
+from sim.surface_points import SurfacePoints
 from sim.tissue_model import ModelInputs
 from sim.viscoelasticity import PronyTerm, Relaxation
 
@@ -81,8 +83,12 @@ class NeoHookean:
             points, area_mm2 = stored(surface_points, inputs.organ, spacing_mm)
             # Between organ and support is its fat, whose stiffness takes the place of friction.
             in_fat = any(isinstance(tether, PerirenalFat) for tether in inputs.tethers)
+            barrier, tools = None, [shape for shape in inputs.shapes if shape.moves]
+            if tools:
+                between, between_mm2 = stored(surface_points, inputs.organ, BARRIER_SPACING_MM)
+                barrier = PenetrationBarrier(body, lattice, between, between_mm2, tools)
             surface = points, area_mm2, inputs.shapes
-            contacts = SurfaceContacts(body, lattice, *surface, inputs.friction, support_is_smooth=in_fat)
+            contacts = SurfaceContacts(body, lattice, *surface, inputs.friction, in_fat, barrier)
         material = Material(tissue.young_kpa, tissue.poisson, tissue.density_g_cm3)
         parts = [part.material for part in inputs.parts]
         fixed = None
@@ -142,7 +148,6 @@ class NeoHookean:
         if tether_n_mm is not None:
             self.tether = field_of(N_MM * tether_n_mm, 2)
         self._whole_tether = tether_n_mm
-        self._whole_points = None if contacts is None else (contacts.rest_points, contacts.rest_area_mm2)
         self.load_g = load_g
         self.capsule: Any = capsule
         self.has_capsule = capsule is not None
@@ -219,7 +224,7 @@ class NeoHookean:
         self.parts = self.parts if parts is None else tuple(parts)
         self.mu, self.lambda_ = self.material.mu, self.material.lambda_
         if self.contacts is not None:
-            self.contacts.stiffness = young_kpa / PENALTY_DEPTH_MM
+            self.contacts.set_stiffness(young_kpa / PENALTY_DEPTH_MM)
         if self.has_parts:
             mu, lambda_, _ = mixture(self.material, self.parts, self.lattice.share)
             self._fill_stiffness(mu / self.material.mu)
@@ -246,15 +251,18 @@ class NeoHookean:
             volume = [lattice.node_mass(np.ones(self.count)) for lattice in (self.lattice, whole)]
             share = np.minimum(volume[0] / volume[1], 1.0)
             self.set_tether(self._whole_tether * share[:, None, None])
-        if self._whole_points is not None:
-            spacing_mm = POINT_SPACING_CELLS * whole.cell_mm
-            points = self._whole_points
-            if tissue is not None:
-                points = points_without(*points, tissue, spacing_mm)
-            self.contacts.set_points(self.lattice, *points)
+        if self.has_contacts:
+            self._leave(self.contacts, tissue, POINT_SPACING_CELLS * whole.cell_mm)
+            if self.contacts.has_barrier:
+                self._leave(self.contacts.barrier, tissue, BARRIER_SPACING_MM)
         if self.has_capsule:
             share = np.ones(self.capsule.count) if tissue is None else patch_shares(organ, whole, tissue)
             self.capsule.set_share(share)
+
+    def _leave(self, points: SurfacePoints, tissue: RemovedTissue | None, spacing_mm: float) -> None:
+        """Of points on the whole organ's surface leave those that removed tissue leaves."""
+        left = points.whole if tissue is None else points_without(*points.whole, tissue, spacing_mm)
+        points.set_points(self.lattice, *left)
 
     def set_tether(self, tether_n_mm: np.ndarray) -> None:
         """Change the stiffness (n, 3, 3) of the springs [N/mm]; only where there were any from the start."""

@@ -47,7 +47,8 @@ class ShapeContacts:
         self.plane = zeros(body.count, len(shapes), 4, within=1)
         if self.has_friction:
             self.push = zeros(body.count, len(shapes), 4, within=1)
-        self.count = body.count
+        # The points that keep a tool's proxy out.
+        self.proxy_points, self.count = self, body.count
         self.touched = zeros(body.count, kind=ti.i32)
         self.last_query = zeros(body.count, len(shapes), 4, within=1)
         self.reset()
@@ -70,6 +71,12 @@ class ShapeContacts:
     def surface_ball(self, i):
         """Particle i, and its radius [mm]."""
         return tm.vec4(self.body.position[i], self.body.contact_radius[i])
+
+    @ti.func
+    def may_be_within(self, i, place, reach):
+        """Whether particle i is within a reach [mm] of a place."""
+        reach += self.body.contact_radius[i]
+        return (self.body.position[i] - place).norm_sqr() < reach * reach
 
     @ti.func
     def is_clear(self, s: ti.template(), i, p, distance):

@@ -34,14 +34,15 @@ MOST_AXIAL_MM = 2.0
 
 
 class Proxy:
-    """The proxy of a tool that may touch the points of ``contacts``."""
+    """The proxy of a tool that may touch the ``count`` points of a ``surface``, each a ball."""
 
-    def __init__(self, contacts: Any, tool: ConvexTool) -> None:
-        self.contacts, self.tool = contacts, tool
+    def __init__(self, surface: Any, tool: ConvexTool) -> None:
+        self.surface, self.tool = surface, tool
         self.start = zeros(4, 4, within=2)
         # Fraction of the path, and retreat from it.
         self.reached = zeros(4, within=1)
-        self.near = zeros(contacts.count, kind=ti.i32)
+        # The points that it may touch: place and radius.
+        self.near = zeros(surface.count, 4, within=1)
 
     def pose_towards(self, pose: np.ndarray, goal: np.ndarray, most_mm: float) -> np.ndarray:
         """The pose (4, 4) of the tool that follows a goal (4, 4) from a pose (4, 4), world from tool [mm].
@@ -88,11 +89,9 @@ class Proxy:
     def gather_near(self, length):
         """The points that the tool may touch on a path of a length [mm]: their number."""
         middle, count = self.start[None][:3, 3], 0
-        for q in range(self.contacts.count):
-            point = self.contacts.surface_ball(q)
-            reach = self.tool.ball_mm + length + point.w
-            if (point.xyz - middle).norm_sqr() < reach * reach:
-                self.near[count] = q
+        for q in range(self.surface.count):
+            if self.surface.may_be_within(q, middle, self.tool.ball_mm + length):
+                self.near[count] = self.surface.surface_ball(q)
                 count += 1
         return count
 
@@ -134,7 +133,7 @@ class Proxy:
         rotation, middle = pose[:3, :3], pose[:3, 3] + retreat
         nearest, place = tm.vec4(0.0, 0.0, 0.0, FAR), tm.vec3(0.0)
         for k in range(count):
-            point = self.contacts.surface_ball(self.near[k])
+            point = self.near[k]
             offset = point.xyz - middle
             bound = offset.norm() - self.tool.ball_mm - point.w
             if bound < nearest.w:

@@ -8,18 +8,20 @@ stiffness, and friction with elastic tangential slip, limited by the coefficient
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import taichi as ti
 import taichi.math as tm
-from scipy.sparse import csr_array
 
 from sim.body import Body
-from sim.fields import array_of, fields_of, fill, fill_evenly, zeros
+from sim.fields import array_of, fill, fill_evenly, zeros
 from sim.friction import sticking_fraction, tangential
 from sim.kernels import kernel
 from sim.lattice import Lattice
+from sim.penetration_barrier import PenetrationBarrier
 from sim.shapes import FAR, TimeOfImpact, check_count
+from sim.surface_points import SurfacePoints
 
 # Depth in a shape at which the contact pressure is Young's modulus.
 PENALTY_DEPTH_MM = 0.05
@@ -58,15 +60,15 @@ class ContactLoad:
     friction_ratio: float
 
 
-class SurfaceContacts:
-    """Contact points on the surface, each interpolated from 8 nodes, and their contacts; at most MOST_SHAPES
-    shapes.
+class SurfaceContacts(SurfacePoints):
+    """Contact points on the surface and their contacts; at most MOST_SHAPES shapes.
 
-    point (p,): current positions [mm]. plane (shapes, p): normal and offset of n . x >= offset [mm]. slip
+    plane (shapes, p): normal and offset of n . x >= offset [mm]. slip
     (shapes, p): elastic tangential slip [mm]. near (p,): bits of the shapes that are near. last_query
     (shapes, p): point and distance [mm] of the last distance query. ``stiffness`` [kPa/mm]: penalty
     stiffness; ``coefficient``: Coulomb's, where there was friction from the start: on all shapes, or where
-    the ``support_is_smooth`` on those alone that move.
+    the ``support_is_smooth`` on those alone that move. A ``barrier`` keeps tools out between the points;
+    ``proxy_points`` are those that keep a tool's proxy out.
     """
 
     def __init__(
@@ -78,21 +80,16 @@ class SurfaceContacts:
         shapes: list,
         friction: float,
         support_is_smooth: bool = False,
+        barrier: PenetrationBarrier | None = None,
     ) -> None:
         check_count(shapes)
-        self.body = body
+        super().__init__(body, lattice, points, area_mm2)
         self.shapes = list(shapes)
         self.time_of_impact = TimeOfImpact(shapes)
         self.coefficient, self.has_friction = friction, friction > 0
         self.is_rough = [self.has_friction and (shape.moves or not support_is_smooth) for shape in shapes]
-        self.count = len(points)
-        self.rest_points, self.rest_area_mm2 = points, area_mm2
-        self.point = zeros(self.count, 3, within=1)
         self.start = zeros(self.count, 3, within=1)
         self.near = zeros(self.count, kind=ti.i32)
-        nodes, weights, *by_node = self._interpolation(lattice, points)
-        self.node, self.weight = fields_of(nodes, weights, within=1)
-        self.area, self.node_start, self.node_point, self.node_weight = fields_of(area_mm2, *by_node)
         self.plane = zeros(len(shapes), self.count, 4, within=1)
         self.last_query = zeros(len(shapes), self.count, 4, within=1)
         # ``found`` and ``stick`` are the names in session files.
@@ -100,6 +97,11 @@ class SurfaceContacts:
         if self.has_friction:
             self.slip = zeros(len(shapes), self.count, 3, within=1)
             self.state["stick"] = self.slip
+        self.barrier: Any = barrier
+        self.has_barrier = barrier is not None
+        self.proxy_points = self if barrier is None else barrier
+        if barrier is not None:
+            self.state["barrier"] = barrier.block_load
         self.stiffness = 0.0
         self.penetration = zeros()
         self.blocks = -(-self.count // BLOCK)
@@ -107,25 +109,18 @@ class SurfaceContacts:
         self.block_load = zeros(self.blocks, 9, within=1)
         self.reset()
 
-    def _interpolation(self, lattice: Lattice, points: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Nodes and weights (p, 8) of points; and by node: the first entry (n + 1,), the points and their
-        weights (8 p,).
-        """
-        nodes, weights = lattice.interpolation.attach(points)
-        offsets = np.arange(0, nodes.size + 1, nodes.shape[1])
-        of_nodes = csr_array(
-            (weights.ravel(), nodes.ravel(), offsets), shape=(len(nodes), self.body.count)
-        ).T.tocsr()
-        return nodes, weights, of_nodes.indptr, of_nodes.indices, of_nodes.data
+    def set_stiffness(self, stiffness: float) -> None:
+        """Change the penalty stiffness [kPa/mm]."""
+        self.stiffness = stiffness
+        if self.barrier is not None:
+            self.barrier.stiffness = stiffness
 
     def set_points(self, lattice: Lattice, points: np.ndarray, area_mm2: np.ndarray) -> None:
         """Put the contact points at other places (p, 3) [mm] at rest, with other areas (p,) [mm^2]; those
         of another place lose their friction.
         """
         before = array_of(self.node), array_of(self.weight)
-        self.rest_points, self.rest_area_mm2 = points, area_mm2
-        fields = self.node, self.weight, self.node_start, self.node_point, self.node_weight
-        fill((self.area, area_mm2), *zip(fields, self._interpolation(lattice, points), strict=True))
+        super().set_points(lattice, points, area_mm2)
         if self.has_friction:
             now = array_of(self.node), array_of(self.weight)
             moved = np.any([(a != b).any(axis=1) for a, b in zip(before, now, strict=True)], axis=0)
@@ -137,6 +132,8 @@ class SurfaceContacts:
         """Clear stored distances and friction; call it after other code has moved the body."""
         fill_evenly(self.last_query, -FAR)
         fill_evenly(self.near, 0)
+        if self.barrier is not None:
+            self.barrier.reset()
         if self.has_friction:
             fill_evenly(self.slip, 0.0)
 
@@ -149,21 +146,10 @@ class SurfaceContacts:
         fill(*((self.state[name], values) for name, values in state.items()))
 
     @ti.func
-    def surface_ball(self, q):
-        """Point q of the surface, and its radius [mm]."""
-        return tm.vec4(self.point[q], 0.0)
-
-    @ti.func
-    def interpolated(self, field: ti.template(), q):
-        """Position of point q for the nodes' positions in a field."""
-        x = tm.vec3(0.0)
-        for k in ti.static(range(8)):
-            x += self.weight[q][k] * field[self.node[q][k]]
-        return x
-
-    @ti.func
     def find(self):
         """Lines 6-9: the contact planes of the shapes that each point's predicted position is near to."""
+        if ti.static(self.has_barrier):
+            self.barrier.find()
         for q in range(self.count):
             p, start = self.interpolated(self.body.predicted, q), self.interpolated(self.body.position, q)
             self.point[q], self.start[q] = p, start
@@ -252,6 +238,8 @@ class SurfaceContacts:
     def node_force(self, i):
         """Force [uN] of the shapes on node i, and its negative derivative (3, 3) by the node's position."""
         force, stiffness = tm.vec3(0.0), tm.mat3(0.0)
+        if ti.static(self.has_barrier):
+            force, stiffness = self.barrier.node_force(i)
         for k in range(self.node_start[i], self.node_start[i + 1]):
             q = self.node_point[k]
             near = self.near[q]
@@ -314,6 +302,8 @@ class SurfaceContacts:
     @ti.func
     def follow(self, i, change):
         """Move the points of node i with it. Nodes of one colour have no point in common."""
+        if ti.static(self.has_barrier):
+            self.barrier.follow(i, change)
         for k in range(self.node_start[i], self.node_start[i + 1]):
             q = self.node_point[k]
             self.point[q] = self.point[q] + self.node_weight[k] * change
@@ -325,6 +315,8 @@ class SurfaceContacts:
     @ti.func
     def finish(self):
         """End of a substep: store the tangential slip."""
+        if ti.static(self.has_barrier):
+            self.barrier.finish()
         if ti.static(self.has_friction):
             for q in range(self.count):
                 for s in ti.static(range(len(self.shapes))):
@@ -342,6 +334,9 @@ class SurfaceContacts:
         """
         self._sum_forces(self.shapes.index(shape), *about.tolist())
         total = 1e-6 * array_of(self.block_load).sum(axis=0, dtype=np.float64)
+        if self.barrier is not None and shape in self.barrier.tools:
+            force, torque, size = np.split(self.barrier.load(shape), (3, 6))
+            total[:7] += np.concatenate([force, torque - np.cross(about, force), size])
         normal, tangential, sliding = total[6:].tolist()
         if normal == 0.0:
             return ContactLoad(-total[:6], 0.0, 0.0)

@@ -33,6 +33,10 @@ class Points:
     def surface_ball(self, q):
         return tm.vec4(self.point[q], self.radius_mm)
 
+    @ti.func
+    def may_be_within(self, q, place, reach):
+        return (self.point[q] - place).norm() < reach + self.radius_mm
+
 
 def floor() -> np.ndarray:
     """Points of the plane z = 0."""

@@ -1,0 +1,143 @@
+"""A barrier that keeps the edges of a tool out of the tissue between the contact points.
+
+Contact points are the quadrature of the pressure, half an element apart: between them an edge or a corner of
+a tool can be millimetres deep in the surface. The barrier has many more points. Each exerts a force only
+where it is deeper in a tool than BARRIER_MM: presses that the contact points bear alone stay as they are. It
+has their penalty stiffness, and no friction.
+"""
+
+import numpy as np
+import taichi as ti
+import taichi.math as tm
+
+from sim.body import Body
+from sim.fields import array_of, fill_evenly, zeros
+from sim.lattice import Lattice
+from sim.surface_points import SurfacePoints
+
+# Spacing of the points, and the depth in a tool from which on they exert a force. At 0.4 mm it would change
+# the forces and beads of presses that are right without it (docs/accuracy.md).
+BARRIER_SPACING_MM, BARRIER_MM = 1.0, 0.5
+# Points farther outside a tool than this do not get so deep within a step.
+NEAR_MM = 0.3
+# Deeper points are left to the contact points, which know by which side they came.
+DEEPEST_MM = 2.0
+# How far a point may be from the first node of its element in strained tissue, in widths of a cell.
+REACH_CELLS = 3.0
+# Forces are summed in blocks of this many points, in an order that does not depend on threads.
+BLOCK = 64
+
+
+class PenetrationBarrier(SurfacePoints):
+    """Points on the surface, and the tools that they are near to.
+
+    plane (tools, p): normal and offset of n . x >= offset [mm]. near (p,): bits of the tools that are near.
+    active (n,): whether a node has such a point. block_load (tools, b): of the points of each block, at the
+    end of the last substep, force [uN], torque about the origin [uN mm] and sum of the normal forces [uN].
+    ``stiffness`` [kPa/mm] is the penalty stiffness.
+    """
+
+    def __init__(
+        self, body: Body, lattice: Lattice, points: np.ndarray, area_mm2: np.ndarray, tools: list
+    ) -> None:
+        super().__init__(body, lattice, points, area_mm2)
+        self.tools = list(tools)
+        self.reach_mm = REACH_CELLS * lattice.cell_mm
+        self.near = zeros(self.count, kind=ti.i32)
+        self.active = zeros(body.count, kind=ti.i32)
+        self.plane = zeros(len(tools), self.count, 4, within=1)
+        self.blocks = -(-self.count // BLOCK)
+        self.block_load = zeros(len(tools), self.blocks, 7, within=1)
+        self.stiffness = 0.0
+
+    def reset(self) -> None:
+        """Clear forces and what is near; call it after other code has moved the body."""
+        for field in (self.near, self.active, self.block_load):
+            fill_evenly(field, 0)
+
+    def load(self, tool: object) -> np.ndarray:
+        """Of the points that a tool touches (7,): the tool's force [N], its torque about the origin [N mm],
+        and the sum of the normal forces [N].
+        """
+        return 1e-6 * array_of(self.block_load)[self.tools.index(tool)].sum(axis=0, dtype=np.float64)
+
+    @ti.func
+    def surface_ball(self, q):
+        """Point q of the surface, and its radius [mm]."""
+        return tm.vec4(self.interpolated(self.body.position, q), 0.0)
+
+    @ti.func
+    def may_be_within(self, q, place, reach):
+        """Whether point q may be within a reach [mm] of a place."""
+        return (self.body.position[self.node[q][0]] - place).norm_sqr() < (reach + self.reach_mm) ** 2
+
+    @ti.func
+    def find(self):
+        """The planes of the tools that each point's predicted position is near to."""
+        for i in range(self.body.count):
+            self.active[i] = 0
+        for q in range(self.count):
+            near = 0
+            for s in ti.static(range(len(self.tools))):
+                if not self.tools[s].is_beyond(self.body.predicted[self.node[q][0]], self.reach_mm):
+                    p = self.interpolated(self.body.predicted, q)
+                    surface = self.tools[s].surface(p)
+                    if -DEEPEST_MM < surface.w < NEAR_MM:
+                        self.point[q] = p
+                        self.plane[s, q] = tm.vec4(surface.xyz, surface.xyz.dot(p) - surface.w - BARRIER_MM)
+                        near |= 1 << s
+            self.near[q] = near
+            if near > 0:
+                for k in ti.static(range(8)):
+                    self.active[self.node[q][k]] = 1
+
+    @ti.func
+    def depth(self, s: ti.template(), q):
+        """How far [mm] point q is beyond the barrier in tool s, 0 before it."""
+        plane = self.plane[s, q]
+        depth = ti.max(plane.w - plane.xyz.dot(self.point[q]), 0.0)
+        return depth if (self.near[q] >> s) & 1 else 0.0
+
+    @ti.func
+    def node_force(self, i):
+        """Force [uN] of the tools on node i, and its negative derivative (3, 3) by the node's position."""
+        force, stiffness = tm.vec3(0.0), tm.mat3(0.0)
+        if self.active[i] > 0:
+            for k in range(self.node_start[i], self.node_start[i + 1]):
+                q = self.node_point[k]
+                if self.near[q] > 0:
+                    weight = self.node_weight[k]
+                    for s in ti.static(range(len(self.tools))):
+                        depth = self.depth(s, q)
+                        if depth > 0.0:
+                            normal = self.plane[s, q].xyz
+                            penalty = weight * 1e3 * self.stiffness * self.area[q]
+                            force += penalty * depth * normal
+                            stiffness += weight * penalty * normal.outer_product(normal)
+        return force, stiffness
+
+    @ti.func
+    def follow(self, i, change):
+        """Move the points of node i with it. Nodes of one colour have no point in common."""
+        if self.active[i] > 0:
+            for k in range(self.node_start[i], self.node_start[i + 1]):
+                q = self.node_point[k]
+                if self.near[q] > 0:
+                    self.point[q] = self.point[q] + self.node_weight[k] * change
+
+    @ti.func
+    def finish(self):
+        """End of a substep: sum the forces of each block."""
+        for block in range(self.blocks):
+            for s in ti.static(range(len(self.tools))):
+                force, torque, size = tm.vec3(0.0), tm.vec3(0.0), 0.0
+                for q in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.count)):
+                    depth = self.depth(s, q)
+                    if depth > 0.0:
+                        pressed = 1e3 * self.stiffness * self.area[q] * depth
+                        size += pressed
+                        force += pressed * self.plane[s, q].xyz
+                        torque += self.point[q].cross(pressed * self.plane[s, q].xyz)
+                for k in ti.static(range(3)):
+                    self.block_load[s, block][k], self.block_load[s, block][k + 3] = force[k], torque[k]
+                self.block_load[s, block][6] = size
