@@ -19,7 +19,7 @@ from rehearsal.resection.resection_state import Resection
 from rehearsal.resection.score_line import ResectionError
 from rehearsal.tissue_voxels import tissue_voxels
 from scenes.anatomy import Grid, LoadedAnatomy
-from scenes.surfaces import translated, volume_mm3
+from scenes.surfaces import FineSurface, translated, volume_mm3
 from sim.embedding import Embedding
 from sim.fields import Field, array_of
 from sim.skinning import Interpolation, Skin
@@ -63,6 +63,7 @@ class DeformedAnatomy:
         self.supports = [_shrunk(translated(mesh, -case.origin), SUPPORT_SUNK_MM) for mesh in meshes]
         self._judged: tuple[Resection, Judgement | None, str] | None = None
         self._skins: dict[str, Skin] = {}
+        self._fine: tuple[FineSurface, Skin] | None = None
         self._version = -1
         image = case.scene.image
         margin = SURROUNDINGS_MM if shows_ct(image.outside) else 0.0
@@ -84,7 +85,7 @@ class DeformedAnatomy:
             skin.update()
 
     def _change_geometry(self, geometry: RestGeometry) -> None:
-        self._version = geometry.version
+        self._version, self._fine = geometry.version, None
         self._carrier.interpolation = geometry.interpolation
         self._skins = {"organ": Skin(self._carrier, geometry.organ.vertices)}
         self._skins |= {f"part {name}": self.skin(part.vertices) for name, part in geometry.parts.items()}
@@ -136,6 +137,17 @@ class DeformedAnatomy:
     def vertices(self) -> np.ndarray:
         """Present vertices (n, 3) [mm] of the organ's surface."""
         return array_of(self._skins["organ"].vertices).astype(float)
+
+    def fine_organ(self) -> tuple[FineSurface, np.ndarray]:
+        """The organ's surface with each face divided in four, which follows a probe's edges more closely, and
+        its present vertices (n, 3) [mm].
+        """
+        if self._fine is None:
+            fine = FineSurface.of(self.organ)
+            self._fine = fine, self.skin(fine.vertices)
+        fine, skin = self._fine
+        skin.update()
+        return fine, array_of(skin.vertices).astype(float)
 
     @property
     def tumour_vertices(self) -> np.ndarray:

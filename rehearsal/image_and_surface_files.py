@@ -90,21 +90,22 @@ def save_surfaces(anatomy: DeformedAnatomy, out: Path, prefix: str = "") -> None
     """Write organ, tumour, and a specimen as it was cut (PLY, mm, LPS), and the score in the CT, and print
     the paths.
 
-    Vertices are in the order of the rest surfaces.
+    Vertices are in the order of the rest surfaces; the organ's are followed by the midpoints of its edges.
     """
-    deformed = {"organ": (anatomy.organ, anatomy.vertices)}
+    fine, vertices = anatomy.fine_organ()
+    deformed = {"organ": (fine.faces, vertices)}
     if anatomy.tumour is not None:
-        deformed["tumour"] = anatomy.tumour, anatomy.tumour_vertices
+        deformed["tumour"] = anatomy.tumour.faces, anatomy.tumour_vertices
     if anatomy.cut is not None:
         specimen = anatomy.cut.specimen
-        deformed["specimen"] = specimen, anatomy.carried_then(specimen.vertices)
+        deformed["specimen"] = specimen.faces, anatomy.carried_then(specimen.vertices)
     marks = anatomy.frame.resection.points()
     # A line that cannot be drawn was refused in words already.
     with suppress(ResectionError):
         if len(marks) >= LEAST_MARKS:
             line = score_line(anatomy.case.organ, marks)
             click.echo(f"Saved {save_score(anatomy.case, line, out, prefix)}")
-    for name, (rest, vertices) in deformed.items():
+    for name, (faces, vertices) in deformed.items():
         path = out / f"{prefix}{name}.ply"
-        save_surface(trimesh.Trimesh(vertices + anatomy.case.origin, rest.faces, process=False), path)
+        save_surface(trimesh.Trimesh(vertices + anatomy.case.origin, faces, process=False), path)
         click.echo(f"Saved {path}")

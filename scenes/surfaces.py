@@ -3,6 +3,7 @@ from it.
 """
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
@@ -28,6 +29,38 @@ MOST_BYTES, MOST_COMMENT_BYTES = 1 << 29, 1 << 16
 # Of a grid, distances are computed at every second point first.
 COARSENESS = 2
 EXPECTED = "a closed surface in an STL, PLY or OBJ file, in mm"
+
+
+@dataclass(frozen=True)
+class FineSurface:
+    """A closed surface with each of its faces divided in four.
+
+    vertices (v, 3) [mm]: first the ``coarse_count`` of the surface, then the midpoints of its edges. coarse
+    (f, 3): its faces; divided (f, 4, 3): the four of each.
+    """
+
+    vertices: np.ndarray
+    coarse: np.ndarray
+    divided: np.ndarray
+    coarse_count: int
+
+    @staticmethod
+    def of(surface: trimesh.Trimesh) -> "FineSurface":
+        """The fine surface of a surface."""
+        whole = np.asarray(surface.vertices), np.asarray(surface.faces)
+        vertices, faces, four = trimesh.remesh.subdivide(*whole, return_index=True)
+        divided = np.array([faces[four[face]] for face in range(len(whole[1]))])
+        return FineSurface(vertices, whole[1], divided, len(whole[0]))
+
+    @property
+    def faces(self) -> np.ndarray:
+        """All faces (4 f, 3)."""
+        return self.divided.reshape(-1, 3)
+
+    def faces_where(self, is_near: np.ndarray) -> np.ndarray:
+        """Faces (n, 3), divided where one of the ``coarse_count`` vertices ``is_near``, coarse elsewhere."""
+        near = is_near[self.coarse].any(axis=1)
+        return np.concatenate([self.coarse[~near], self.divided[near].reshape(-1, 3)])
 
 
 def is_surface_file(path: Path) -> bool:

@@ -1,9 +1,8 @@
 """A barrier that keeps the edges of a tool out of the tissue between the contact points.
 
 Contact points are the quadrature of the pressure, half an element apart: between them an edge or a corner of
-a tool can be millimetres deep in the surface. The barrier has many more points. Each exerts a force only
-where it is deeper in a tool than BARRIER_MM: presses that the contact points bear alone stay as they are. It
-has their penalty stiffness, and no friction.
+a tool can be millimetres deep in the surface. The barrier has many more points. They touch a slightly smaller
+tool with rounder edges, without friction: presses that the contact points bear alone stay as they are.
 """
 
 import numpy as np
@@ -15,13 +14,18 @@ from sim.fields import array_of, fill_evenly, zeros
 from sim.lattice import Lattice
 from sim.surface_points import SurfacePoints
 
-# Spacing of the points, and the depth in a tool from which on they exert a force. At 0.4 mm it would change
-# the forces and beads of presses that are right without it (docs/accuracy.md).
-BARRIER_SPACING_MM, BARRIER_MM = 1.0, 0.5
-# Points farther outside a tool than this do not get so deep within a step.
-NEAR_MM = 0.3
-# Deeper points are left to the contact points, which know by which side they came.
-DEEPEST_MM = 2.0
+# Spacing of the points.
+BARRIER_SPACING_MM = 1.0
+# How far the smaller tool's faces are inside the tool, in widths of a cell: wide elements follow its edges
+# less. With less, the barrier would bear a part of presses that are right without it (docs/accuracy.md).
+INSET_CELLS = 0.09
+# Radius of the smaller tool's edges. At sharp ones the direction of the force would jump, and the tissue
+# never come to rest.
+RADIUS_MM = 1.5
+# Penalty stiffness over that of the contact points: an edge is borne by few points.
+STIFFNESS_RATIO = 4.0
+# Points farther outside the smaller tool than this do not get into it within a step.
+NEAR_MM = 0.8
 # How far a point may be from the first node of its element in strained tissue, in widths of a cell.
 REACH_CELLS = 3.0
 # Forces are summed in blocks of this many points, in an order that does not depend on threads.
@@ -34,7 +38,7 @@ class PenetrationBarrier(SurfacePoints):
     plane (tools, p): normal and offset of n . x >= offset [mm]. near (p,): bits of the tools that are near.
     active (n,): whether a node has such a point. block_load (tools, b): of the points of each block, at the
     end of the last substep, force [uN], torque about the origin [uN mm] and sum of the normal forces [uN].
-    ``stiffness`` [kPa/mm] is the penalty stiffness.
+    ``stiffness`` [kPa/mm]: that of the contact points.
     """
 
     def __init__(
@@ -42,12 +46,14 @@ class PenetrationBarrier(SurfacePoints):
     ) -> None:
         super().__init__(body, lattice, points, area_mm2)
         self.tools = list(tools)
-        self.reach_mm = REACH_CELLS * lattice.cell_mm
+        self.reach_mm, self.inset_mm = REACH_CELLS * lattice.cell_mm, INSET_CELLS * lattice.cell_mm
         self.near = zeros(self.count, kind=ti.i32)
         self.active = zeros(body.count, kind=ti.i32)
         self.plane = zeros(len(tools), self.count, 4, within=1)
         self.blocks = -(-self.count // BLOCK)
         self.block_load = zeros(len(tools), self.blocks, 7, within=1)
+        # A thinner tool has no edges of this radius.
+        self.radius_mm = max(0.0, min(RADIUS_MM, *(tool.inner_ball_mm - self.inset_mm for tool in tools)))
         self.stiffness = 0.0
 
     def reset(self) -> None:
@@ -81,10 +87,11 @@ class PenetrationBarrier(SurfacePoints):
             for s in ti.static(range(len(self.tools))):
                 if not self.tools[s].is_beyond(self.body.predicted[self.node[q][0]], self.reach_mm):
                     p = self.interpolated(self.body.predicted, q)
-                    surface = self.tools[s].surface(p)
-                    if -DEEPEST_MM < surface.w < NEAR_MM:
+                    surface = self.tools[s].inner_surface(p, self.inset_mm, self.radius_mm)
+                    # Deeper points are left to the contact points, which know by which side they came.
+                    if -self.radius_mm < surface.w < NEAR_MM:
                         self.point[q] = p
-                        self.plane[s, q] = tm.vec4(surface.xyz, surface.xyz.dot(p) - surface.w - BARRIER_MM)
+                        self.plane[s, q] = tm.vec4(surface.xyz, surface.xyz.dot(p) - surface.w)
                         near |= 1 << s
             self.near[q] = near
             if near > 0:
@@ -93,7 +100,7 @@ class PenetrationBarrier(SurfacePoints):
 
     @ti.func
     def depth(self, s: ti.template(), q):
-        """How far [mm] point q is beyond the barrier in tool s, 0 before it."""
+        """Depth [mm] of point q in the smaller tool s, 0 outside."""
         plane = self.plane[s, q]
         depth = ti.max(plane.w - plane.xyz.dot(self.point[q]), 0.0)
         return depth if (self.near[q] >> s) & 1 else 0.0
@@ -111,7 +118,7 @@ class PenetrationBarrier(SurfacePoints):
                         depth = self.depth(s, q)
                         if depth > 0.0:
                             normal = self.plane[s, q].xyz
-                            penalty = weight * 1e3 * self.stiffness * self.area[q]
+                            penalty = weight * 1e3 * STIFFNESS_RATIO * self.stiffness * self.area[q]
                             force += penalty * depth * normal
                             stiffness += weight * penalty * normal.outer_product(normal)
         return force, stiffness
@@ -134,7 +141,7 @@ class PenetrationBarrier(SurfacePoints):
                 for q in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.count)):
                     depth = self.depth(s, q)
                     if depth > 0.0:
-                        pressed = 1e3 * self.stiffness * self.area[q] * depth
+                        pressed = 1e3 * STIFFNESS_RATIO * self.stiffness * self.area[q] * depth
                         size += pressed
                         force += pressed * self.plane[s, q].xyz
                         torque += self.point[q].cross(pressed * self.plane[s, q].xyz)

@@ -147,6 +147,8 @@ class ConvexTool:
         core = np.column_stack([normals, np.asarray(offsets_mm, float) - self.edge_radius])
         self.half_space = field_of(core, 1)
         self.ball_mm = self.edge_radius + _farthest_vertex(core)
+        # Radius of the ball about the origin that is inside.
+        self.inner_ball_mm = float(np.min(offsets_mm))
         self.pose = zeros(4, 4, within=2)
         self.step_back = zeros(4, 4, within=2)
         self.path = zeros(MOST_SUBSTEPS, 2, 4, 4, within=2)
@@ -228,10 +230,29 @@ class ConvexTool:
     @ti.func
     def surface_from(self, local):
         """``surface`` in the tool's own frame."""
+        return self.rounded_surface(local, 0.0, self.edge_radius)
+
+    @ti.func
+    def inner_surface(self, p, inset: float, radius: float):
+        """``surface`` of a smaller tool: its faces an inset [mm] inside this one's, its edges rounded by a
+        radius [mm].
+        """
+        pose = self.pose[None]
+        rotation = pose[:3, :3]
+        local = rotation.transpose() @ (p - pose[:3, 3])
+        surface = self.rounded_surface(local, inset + radius - self.edge_radius, radius)
+        return tm.vec4(rotation @ surface.xyz, surface.w)
+
+    @ti.func
+    def rounded_surface(self, local, inset: float, radius: float):
+        """The outward normal and signed distance [mm] of all balls of a radius whose centres are in the
+        half-spaces, these moved inwards by an inset [mm].
+        """
         depth, normal = -FAR, tm.vec3(0.0)
         nearest = local
         for k in range(self.count):
             plane = self.half_space[k]
+            plane.w -= inset
             d = plane.xyz.dot(local) - plane.w
             if d > depth:
                 depth, normal = d, plane.xyz
@@ -242,7 +263,7 @@ class ConvexTool:
         distance = outward.norm()
         if distance > 1e-4:
             depth, normal = distance, outward / distance
-        return tm.vec4(normal, depth - self.edge_radius)
+        return tm.vec4(normal, depth - radius)
 
     @ti.func
     def depth_along_axis(self, local):

@@ -8,6 +8,7 @@ from sim.fields import array_of
 from sim.lattice import Lattice, fill_with_cells, surface_points
 from sim.material import Material
 from sim.neo_hookean import HOURGLASS_STIFFNESS, LATTICE_SETTINGS, LEAST_J, NeoHookean
+from sim.penetration_barrier import BARRIER_SPACING_MM, PenetrationBarrier
 from sim.shapes import ConvexTool
 from sim.solver import Solver, StepSettings
 from sim.surface_contact import SurfaceContacts
@@ -30,16 +31,21 @@ def tissue_of(
     friction: float = 0.0,
     poisson: float = 0.45,
     fixed=None,
+    barrier: bool = False,
 ) -> Solver:
     """A solver of a closed surface [mm] among shapes; ``fixed`` takes nodes (n, 3) and returns the mask of
-    the fixed ones.
+    the fixed ones. With a ``barrier`` between the contact points.
     """
     lattice = fill_with_cells(mesh, cell_mm)
     body = Body(lattice.nodes)
     contacts = None
     if shapes:
         points, area = surface_points(mesh, cell_mm / 2)
-        contacts = SurfaceContacts(body, lattice, points, area, shapes, friction)
+        tools, between = [shape for shape in shapes if shape.moves], None
+        if barrier:
+            at = surface_points(mesh, BARRIER_SPACING_MM)
+            between = PenetrationBarrier(body, lattice, *at, tools)
+        contacts = SurfaceContacts(body, lattice, points, area, shapes, friction, barrier=between)
     fixed = None if fixed is None else fixed(lattice.nodes)
     model = NeoHookean(body, lattice, contacts, Material(YOUNG_KPA, poisson, 1e3 * DENSITY), fixed=fixed)
     return Solver(model, tool=next((s for s in shapes if isinstance(s, ConvexTool)), None))

@@ -12,6 +12,9 @@ from rehearsal.deformed_anatomy import DeformedAnatomy
 from ultrasound.array_contact import depth_in, face_points, footprint, measure_contact
 from ultrasound.probe import Probe
 
+# Around the probe, as far as this, its penetration is measured in the fine surface.
+AROUND_MM = 5.0
+
 
 @dataclass(frozen=True)
 class Measurement:
@@ -85,7 +88,11 @@ def penetration_of(anatomy: DeformedAnatomy) -> float:
     """Depth [mm] of the array face in the deformed organ: of its centre, edges and corners; 0 outside."""
     points = footprint(anatomy.case.probe)
     places = points @ anatomy.pose[:3, :3].T + anatomy.pose[:3, 3]
-    return depth_in(places, anatomy.vertices, anatomy.organ.faces)
+    fine, vertices = anatomy.fine_organ()
+    coarse = vertices[: fine.coarse_count]
+    local = np.abs((coarse - anatomy.pose[:3, 3]) @ anatomy.pose[:3, :3])
+    is_near = (local < np.array(anatomy.case.size_mm) / 2 + AROUND_MM).all(axis=1)
+    return depth_in(places, vertices, fine.faces_where(is_near))
 
 
 def _to_tumour_mm(anatomy: DeformedAnatomy, probe: Probe, tumour: np.ndarray) -> float:
