@@ -10,11 +10,12 @@ import pytest
 import SimpleITK as sitk
 import trimesh
 from conftest import rotation_about
+from scipy.spatial import cKDTree
 
 import app
 from rehearsal.image_and_surface_files import save_surfaces
 from rehearsal.resection.resection_state import NO_RESECTION
-from scenes.surfaces import FORMATS, save_surface
+from scenes.surfaces import FORMATS, FineSurface, save_surface
 from scenes.volumes.volume_files import save_image
 
 pytestmark = pytest.mark.usefixtures("one_device")
@@ -133,10 +134,11 @@ def test_a_surface_says_its_space_and_reads_back_to_float32(tmp_path, suffix):
 def lying(tumour: bool) -> SimpleNamespace:
     """What a file needs of an anatomy: surfaces at rest and as they lie, about an origin."""
     rest, moved_tumour = body(), body(3.0, 0.2).vertices - MIDDLE + [1.0, 0, 0]
+    fine = FineSurface.of(rest)
     return SimpleNamespace(
         case=SimpleNamespace(origin=MIDDLE),
         organ=rest,
-        vertices=rest.vertices - MIDDLE + [0, 0, 2.5],
+        fine_organ=lambda: (fine, fine.vertices - MIDDLE + [0, 0, 2.5]),
         tumour=body(3.0, 0.2) if tumour else None,
         tumour_vertices=moved_tumour,
         cut=None,
@@ -148,7 +150,10 @@ def test_organ_and_tumour_are_saved_as_they_lie_vertex_by_vertex(tmp_path, capsy
     save_surfaces(lying(tumour=True), tmp_path, "004-")
     organ, tumour = vertices_of(tmp_path / "004-organ.ply"), vertices_of(tmp_path / "004-tumour.ply")
     # A float32 of 1204 mm is good to 6e-5.
-    assert np.allclose(organ, body().vertices + [0, 0, 2.5], atol=2e-4)
+    assert np.allclose(organ[: len(body().vertices)], body().vertices + [0, 0, 2.5], atol=2e-4)
+    edges = body().vertices[body().edges_unique].mean(axis=1) + [0, 0, 2.5]
+    assert len(organ) == len(body().vertices) + len(edges)
+    assert cKDTree(organ[len(body().vertices) :]).query(edges)[0].max() < 2e-4
     assert np.allclose(tumour, body(4.0, 0.2).vertices, atol=2e-4)
     assert capsys.readouterr().out.count("Saved ") == 2
     save_surfaces(lying(tumour=False), tmp_path)

@@ -2,11 +2,14 @@
 
 from types import SimpleNamespace
 
+import igl
 import numpy as np
 import pytest
 import trimesh
 
-from rehearsal.measurements.tumour_measurements import Measurement, measure
+from rehearsal.measurements.tumour_measurements import Measurement, measure, penetration_of
+from scenes.surfaces import FineSurface
+from ultrasound.array_contact import footprint
 from ultrasound.probe import load_probe
 
 LINEAR, CURVED = load_probe("linear"), load_probe("curvilinear")
@@ -31,10 +34,13 @@ def anatomy_of(
     what a frame has of the contact.
     """
     organ = organ or ball(30.0)
+    now = np.asarray(organ.vertices if now is None else now, float)
+    fine = FineSurface.of(trimesh.Trimesh(now, organ.faces, process=False))
     return SimpleNamespace(
         case=SimpleNamespace(size_mm=np.array(probe.housing_mm), probe=probe),
         organ=organ,
-        vertices=np.asarray(organ.vertices if now is None else now, float),
+        vertices=now,
+        fine_organ=lambda: (fine, fine.vertices),
         pose=posed() if pose is None else pose,
         tumour=tumour,
         frame=SimpleNamespace(**{"wrench": None, "lag_mm": 0.0, **load}),
@@ -46,6 +52,24 @@ def anatomy_of(
 def reading(probe=LINEAR, touches=None, **parts):
     every = np.ones(probe.number_of_scanlines, bool)
     return measure(anatomy_of(probe=probe, **parts), probe, every if touches is None else touches)
+
+
+def test_penetration_is_that_in_the_whole_fine_surface():
+    """Whose faces far from the probe are left undivided."""
+    organ = ball(30.0)
+    rng = np.random.default_rng(0)
+    organ.vertices += rng.normal(0, 0.2, organ.vertices.shape)
+    probe = load_probe("drop-in")
+    for deep_mm in (-1.0, 0.5, 3.0, 6.0):
+        pose = posed((2.0, 1.0, 29.0 - deep_mm), probe)
+        anatomy = anatomy_of(organ, pose=pose, probe=probe)
+        fine, vertices = anatomy.fine_organ()
+        assert fine.faces_where(np.abs(organ.vertices[:, 2]) > 20).shape[0] < len(fine.faces)
+        places = footprint(probe) @ pose[:3, :3].T + pose[:3, 3]
+        whole = trimesh.Trimesh(vertices, fine.faces, process=False)
+        assert whole.is_watertight
+        distance = igl.signed_distance(places, vertices, fine.faces)[0]
+        assert penetration_of(anatomy) == pytest.approx(max(-distance.min(), 0.0), abs=1e-9)
 
 
 def test_without_a_tumour_there_is_nothing_to_say_of_it():
