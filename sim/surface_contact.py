@@ -63,12 +63,11 @@ class ContactLoad:
 class SurfaceContacts(SurfacePoints):
     """Contact points on the surface and their contacts; at most MOST_SHAPES shapes.
 
-    plane (shapes, p): normal and offset of n . x >= offset [mm]. slip
-    (shapes, p): elastic tangential slip [mm]. near (p,): bits of the shapes that are near. last_query
-    (shapes, p): point and distance [mm] of the last distance query. ``stiffness`` [kPa/mm]: penalty
-    stiffness; ``coefficient``: Coulomb's, where there was friction from the start: on all shapes, or where
-    the ``support_is_smooth`` on those alone that move. A ``barrier`` keeps tools out between the points;
-    ``proxy_points`` are those that keep a tool's proxy out.
+    plane (shapes, p): normal and offset of n . x >= offset [mm]. slip (shapes, p): elastic tangential slip
+    [mm]. near (p,): bits of the shapes that are near. last_query (shapes, p): point and distance [mm] of the
+    last distance query. ``stiffness`` [kPa/mm]: penalty stiffness; ``coefficient``: Coulomb's, where there
+    was friction from the start: on all shapes, or where the ``support_is_smooth`` on those alone that move. A
+    ``barrier`` keeps tools out between the points, and their proxy too (``proxy_points``).
     """
 
     def __init__(
@@ -99,7 +98,7 @@ class SurfaceContacts(SurfacePoints):
             self.state["stick"] = self.slip
         self.barrier: Any = barrier
         self.has_barrier = barrier is not None
-        self.proxy_points = self if barrier is None else barrier
+        self.proxy_points = barrier
         if barrier is not None:
             self.state["barrier"] = barrier.block_load
         self.stiffness = 0.0
