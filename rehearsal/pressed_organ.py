@@ -29,7 +29,6 @@ from sim.device import backend
 from sim.divergence_check import DivergenceCheck, DivergenceState
 from sim.material import Material, Part
 from sim.neo_hookean import NeoHookean
-from sim.proxy import Proxy
 from sim.removed_tissue import RemovedTissue
 from sim.shapes import Plane, SignedDistanceField
 from sim.solver import SolverState
@@ -39,8 +38,8 @@ from sim.viscoelasticity import Relaxation
 from ultrasound.probe_manipulator import advanced, array_face_centre, poses_between
 
 AWAY_MM = 200.0
-# How deep the probe may move into the tissue in a step, before the tissue yields.
-MOST_PENETRATION_MM = 0.7
+# How deep what presses of the probe may move into the tissue in a step, before the tissue yields.
+MOST_PENETRATION_MM = 0.4
 # Round tissue the proxy's path is bent. Of a longer one the solver, for which a path is straight, has the end
 # alone.
 MOST_STRAIGHT_MM = 3.0
@@ -104,7 +103,7 @@ class PressedOrgan:
             parts=self.parts_of_tissue,
         )
         self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
-        self.proxy = Proxy(self.contacts.proxy_points, self.tool)
+        self.proxy = self.contacts.proxy(self.tool)
         self.settings = step_settings(tissue, section)
         self.young_kpa: float | None = getattr(tissue, "young_kpa", None)
         self._set_gravity(case.scene.gravity)
@@ -229,7 +228,7 @@ class PressedOrgan:
         limit_n = self.case.scene.transducer.force_limit_n if presses else TOUCH_N
         wrench = self.wrench()
         goal = hand if wrench is None else within_force(self.pose, hand, wrench[:3], limit_n)
-        return self.proxy.pose_towards(self.pose, goal, MOST_PENETRATION_MM if presses else 0.0)
+        return self.proxy.pose_towards(self.pose, goal, MOST_PENETRATION_MM if presses else 0.0, presses)
 
     def timed_step(
         self,

@@ -10,7 +10,8 @@ from sim.body import ParticleBody
 from sim.fields import array_of, fill, fill_evenly, zeros
 from sim.friction import sticking_fraction, tangential
 from sim.kernels import kernel
-from sim.shapes import FAR, TimeOfImpact, check_count
+from sim.proxy import Proxy
+from sim.shapes import FAR, ConvexTool, TimeOfImpact, check_count
 
 PROJECTION_ITERATIONS = 8
 # Distance around a static shape within which the distance to it must be known, in particle radii.
@@ -47,8 +48,7 @@ class ShapeContacts:
         self.plane = zeros(body.count, len(shapes), 4, within=1)
         if self.has_friction:
             self.push = zeros(body.count, len(shapes), 4, within=1)
-        # The points that keep a tool's proxy out.
-        self.proxy_points, self.count = self, body.count
+        self.count = body.count
         self.touched = zeros(body.count, kind=ti.i32)
         self.last_query = zeros(body.count, len(shapes), 4, within=1)
         self.reset()
@@ -66,6 +66,10 @@ class ShapeContacts:
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Restore a snapshot; the steps that follow give the same bits."""
         fill((self.plane, state["plane"]), (self.last_query, state["found"]))
+
+    def proxy(self, tool: ConvexTool) -> Proxy:
+        """The proxy of a tool."""
+        return Proxy(self, tool)
 
     @ti.func
     def surface_ball(self, i):

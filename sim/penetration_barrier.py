@@ -12,6 +12,8 @@ import taichi.math as tm
 from sim.body import Body
 from sim.fields import array_of, fill_evenly, zeros
 from sim.lattice import Lattice
+from sim.proxy import Proxy
+from sim.shapes import ConvexTool
 from sim.surface_points import SurfacePoints
 
 # Spacing of the points.
@@ -67,6 +69,10 @@ class PenetrationBarrier(SurfacePoints):
         """
         return 1e-6 * array_of(self.block_load)[self.tools.index(tool)].sum(axis=0, dtype=np.float64)
 
+    def proxy(self, tool: ConvexTool) -> Proxy:
+        """The proxy of a tool, which meets what the tool meets."""
+        return Proxy(self, tool, self.inset_mm, self.radius_mm)
+
     @ti.func
     def surface_ball(self, q):
         """Point q of the surface, and its radius [mm]."""
@@ -87,11 +93,14 @@ class PenetrationBarrier(SurfacePoints):
             for s in ti.static(range(len(self.tools))):
                 if not self.tools[s].is_beyond(self.body.predicted[self.node[q][0]], self.reach_mm):
                     p = self.interpolated(self.body.predicted, q)
-                    surface = self.tools[s].inner_surface(p, self.inset_mm, self.radius_mm)
+                    pose = self.tools[s].pose[None]
+                    local = pose[:3, :3].transpose() @ (p - pose[:3, 3])
+                    surface = self.tools[s].inner_surface(local, self.inset_mm, self.radius_mm)
                     # Deeper points are left to the contact points, which know by which side they came.
                     if -self.radius_mm < surface.w < NEAR_MM:
                         self.point[q] = p
-                        self.plane[s, q] = tm.vec4(surface.xyz, surface.xyz.dot(p) - surface.w)
+                        normal = pose[:3, :3] @ surface.xyz
+                        self.plane[s, q] = tm.vec4(normal, normal.dot(p) - surface.w)
                         near |= 1 << s
             self.near[q] = near
             if near > 0:

@@ -34,28 +34,38 @@ MOST_AXIAL_MM = 2.0
 
 
 class Proxy:
-    """The proxy of a tool that may touch the ``count`` points of a ``surface``, each a ball."""
+    """The proxy of a tool that may touch the ``count`` points of a ``surface``, each a ball.
 
-    def __init__(self, surface: Any, tool: ConvexTool) -> None:
+    What presses is a smaller tool: its faces an inset inside the tool, its edges of a radius, by default the
+    tool itself.
+    """
+
+    def __init__(
+        self, surface: Any, tool: ConvexTool, inset_mm: float = 0.0, radius_mm: float | None = None
+    ) -> None:
         self.surface, self.tool = surface, tool
+        self.inset_mm, self.radius_mm = inset_mm, tool.edge_radius if radius_mm is None else radius_mm
         self.start = zeros(4, 4, within=2)
         # Fraction of the path, and retreat from it.
         self.reached = zeros(4, within=1)
         # The points that it may touch: place and radius.
         self.near = zeros(surface.count, 4, within=1)
 
-    def pose_towards(self, pose: np.ndarray, goal: np.ndarray, most_mm: float) -> np.ndarray:
+    def pose_towards(
+        self, pose: np.ndarray, goal: np.ndarray, most_mm: float, presses: bool = True
+    ) -> np.ndarray:
         """The pose (4, 4) of the tool that follows a goal (4, 4) from a pose (4, 4), world from tool [mm].
 
-        It is the goal itself where no point of the tissue is deeper than ``most_mm`` in the tool on its path;
-        else the tool slides along the tissue, or stays before it.
+        It is the goal itself where no point of the tissue is deeper than ``most_mm`` on its path in what
+        ``presses``, or in the whole tool; else the tool slides along the tissue, or stays before it.
         """
         shift = goal[:3, 3] - pose[:3, 3]
         turn = np.zeros(3)
         if not np.array_equal(goal[:3, :3], pose[:3, :3]):
             turn = Rotation.from_matrix(goal[:3, :3] @ pose[:3, :3].T).as_rotvec()
         fill((self.start, pose))
-        self.find(*shift.tolist(), *turn.tolist(), most_mm)
+        inset_mm, radius_mm = (self.inset_mm, self.radius_mm) if presses else (0.0, self.tool.edge_radius)
+        self.find(*shift.tolist(), *turn.tolist(), inset_mm, radius_mm, most_mm)
         share, *retreat = array_of(self.reached).tolist()
         if share == 1.0 and not any(retreat):
             return goal
@@ -65,7 +75,18 @@ class Proxy:
         return reached
 
     @kernel
-    def find(self, x: float, y: float, z: float, turn_x: float, turn_y: float, turn_z: float, most_mm: float):
+    def find(
+        self,
+        x: float,
+        y: float,
+        z: float,
+        turn_x: float,
+        turn_y: float,
+        turn_z: float,
+        inset: float,
+        radius: float,
+        most_mm: float,
+    ):
         """How far the tool gets along a shift [mm] and a rotation vector [rad], and its retreat [mm]."""
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -74,12 +95,15 @@ class Proxy:
             count = self.gather_near(length)
             reached, share, retreat, clearance = tm.vec4(0.0), 0.0, tm.vec3(0.0), 0.0
             # Where the tissue itself has moved into the tool, this gets no worse at least.
-            least = ti.min(-TOLERANCE_MM, self.deepest(self.start[None], retreat, count)[0].w + most_mm)
+            least = ti.min(
+                -TOLERANCE_MM, self.deepest(self.start[None], retreat, count, inset, radius)[0].w + most_mm
+            )
             for _increment in range(MOST_INCREMENTS):
                 is_free = retreat.norm_sqr() == 0.0 or share * length < MOST_CONTACT_PATH_MM
                 if share < 1.0 and clearance >= least and is_free:
                     share = ti.min(1.0, share + (INCREMENT_MM + ti.max(clearance, 0.0)) / length)
-                    back = self.retreat(self.moved(share, shift, turn), retreat, count, most_mm)
+                    pose = self.moved(share, shift, turn)
+                    back = self.retreat(pose, retreat, count, inset, radius, most_mm)
                     retreat, clearance = back.xyz, back.w
                     if clearance >= least:
                         reached = tm.vec4(share, retreat)
@@ -108,17 +132,17 @@ class Proxy:
         return pose
 
     @ti.func
-    def retreat(self, pose, retreat, count, most_mm: float):
+    def retreat(self, pose, retreat, count, inset: float, radius: float, most_mm: float):
         """The retreat [mm] from a pose after which no point is deeper in the tool than ``most_mm``, and how
         far the tool may then move before it meets one; that is negative where there is no such retreat.
         """
         clearance = -FAR
         for projection in range(PROJECTIONS + 1):
             if clearance < 0.0:
-                nearest, local = self.deepest(pose, retreat, count)
+                nearest, local = self.deepest(pose, retreat, count, inset, radius)
                 clearance = nearest.w + most_mm
                 if clearance < 0.0 and projection < PROJECTIONS:
-                    axial = self.tool.depth_along_axis(local) - most_mm
+                    axial = self.tool.depth_along_axis(local) - inset - most_mm
                     if axial < MOST_AXIAL_MM:
                         retreat += (ti.max(axial, 0.0) + ROUNDING_MM) * pose[:3, 2]
                     else:
@@ -126,7 +150,7 @@ class Proxy:
         return tm.vec4(retreat, clearance)
 
     @ti.func
-    def deepest(self, pose, retreat, count):
+    def deepest(self, pose, retreat, count, inset: float, radius: float):
         """The point that is deepest in the tool: the tool's outward normal and signed distance [mm] there,
         and its place, in the tool's own frame.
         """
@@ -141,7 +165,7 @@ class Proxy:
                     nearest.w = bound
                 else:
                     local = rotation.transpose() @ offset
-                    surface = self.tool.surface_from(local)
+                    surface = self.tool.inner_surface(local, inset, radius)
                     if surface.w - point.w < nearest.w:
                         nearest, place = tm.vec4(surface.xyz, surface.w - point.w), local
                         place.z += point.w

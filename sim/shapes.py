@@ -233,15 +233,11 @@ class ConvexTool:
         return self.rounded_surface(local, 0.0, self.edge_radius)
 
     @ti.func
-    def inner_surface(self, p, inset: float, radius: float):
-        """``surface`` of a smaller tool: its faces an inset [mm] inside this one's, its edges rounded by a
-        radius [mm].
+    def inner_surface(self, local, inset: float, radius: float):
+        """``surface``, in the tool's own frame, of a smaller tool: its faces an inset [mm] inside this one's,
+        its edges rounded by a radius [mm].
         """
-        pose = self.pose[None]
-        rotation = pose[:3, :3]
-        local = rotation.transpose() @ (p - pose[:3, 3])
-        surface = self.rounded_surface(local, inset + radius - self.edge_radius, radius)
-        return tm.vec4(rotation @ surface.xyz, surface.w)
+        return self.rounded_surface(local, inset + radius - self.edge_radius, radius)
 
     @ti.func
     def rounded_surface(self, local, inset: float, radius: float):

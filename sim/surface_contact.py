@@ -20,7 +20,8 @@ from sim.friction import sticking_fraction, tangential
 from sim.kernels import kernel
 from sim.lattice import Lattice
 from sim.penetration_barrier import PenetrationBarrier
-from sim.shapes import FAR, TimeOfImpact, check_count
+from sim.proxy import Proxy
+from sim.shapes import FAR, ConvexTool, TimeOfImpact, check_count
 from sim.surface_points import SurfacePoints
 
 # Depth in a shape at which the contact pressure is Young's modulus.
@@ -67,7 +68,7 @@ class SurfaceContacts(SurfacePoints):
     [mm]. near (p,): bits of the shapes that are near. last_query (shapes, p): point and distance [mm] of the
     last distance query. ``stiffness`` [kPa/mm]: penalty stiffness; ``coefficient``: Coulomb's, where there
     was friction from the start: on all shapes, or where the ``support_is_smooth`` on those alone that move. A
-    ``barrier`` keeps tools out between the points, and their proxy too (``proxy_points``).
+    ``barrier`` keeps tools out between the points.
     """
 
     def __init__(
@@ -98,7 +99,6 @@ class SurfaceContacts(SurfacePoints):
             self.state["stick"] = self.slip
         self.barrier: Any = barrier
         self.has_barrier = barrier is not None
-        self.proxy_points = barrier
         if barrier is not None:
             self.state["barrier"] = barrier.block_load
         self.stiffness = 0.0
@@ -325,6 +325,10 @@ class SurfaceContacts(SurfacePoints):
                         if depth > 0.0:
                             slip, _ = self.tangential_slip(s, q, depth)
                         self.slip[s, q] = slip
+
+    def proxy(self, tool: ConvexTool) -> Proxy:
+        """The proxy of a tool; only with a barrier."""
+        return self.barrier.proxy(tool)
 
     def load(self, shape: object, about: np.ndarray) -> ContactLoad:
         """The load of the tissue on a shape in the last step, with the torque about a point (3,) [mm].
