@@ -43,6 +43,8 @@ MOST_PENETRATION_MM = 0.4
 # Round tissue the proxy's path is bent. Of a longer one the solver, for which a path is straight, has the end
 # alone.
 MOST_STRAIGHT_MM = 3.0
+# So is that of a point round which the tool turns on the way.
+MOST_SAGITTA_MM = 0.3
 # Force of a probe that only touches.
 TOUCH_N = 0.1
 # Stiffness of the virtual coupling of hand and probe: the nearer the force is to its limit, the less the
@@ -216,12 +218,22 @@ class PressedOrgan:
         ``notice`` is the message of the divergence check if it restored the state, else empty.
         """
         pose = self._proxy_of(hand, presses)
-        is_bent = pose is not hand and np.linalg.norm(pose[:3, 3] - self.pose[:3, 3]) > MOST_STRAIGHT_MM
-        path = poses_between(pose if is_bent else self.pose, pose, self.settings.substeps)
+        path = poses_between(self._start_of_path(pose, pose is hand), pose, self.settings.substeps)
         self.solver.step(self.settings, path)
         self.notice = self.divergence_check.check(self.settings.time_step_s)
         self.pose, self.hand = pose, hand
         self.steps += 1
+
+    def _start_of_path(self, pose: np.ndarray, is_free: bool) -> np.ndarray:
+        """Where the transducer's path to a pose (4, 4) starts for the solver: at the present pose, or at the
+        pose itself where the path is not straight for the tissue, which the proxy has kept out of it.
+        """
+        length_mm = float(np.linalg.norm(pose[:3, 3] - self.pose[:3, 3]))
+        cosine = (np.trace(pose[:3, :3] @ self.pose[:3, :3].T) - 1) / 2
+        turn = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        sagitta_mm = (length_mm + self.tool.ball_mm * turn) * turn / 8
+        is_straight = sagitta_mm < MOST_SAGITTA_MM and (is_free or length_mm <= MOST_STRAIGHT_MM)
+        return self.pose if is_straight else pose
 
     def _proxy_of(self, hand: np.ndarray, presses: bool) -> np.ndarray:
         """The transducer's next pose (4, 4), within the limits of force and penetration."""
