@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from small_bead_case import briefly, small_anatomy
 
 from rehearsal.case import case_of
@@ -122,3 +123,24 @@ def test_a_hand_that_only_touches_presses_nothing(rehearsal):
         frame = rehearsal.do(Move(pose=rehearsal.pose_at_depth(8.0), presses=False))
     assert np.linalg.norm(frame.wrench[:3]) < 0.2
     assert np.abs(rehearsal.anatomy.vertices - rest).max() < 0.3
+
+
+@pytest.mark.parametrize(
+    ("shift_mm", "turn_deg", "is_free", "is_straight"),
+    [
+        (20, 0, True, True),
+        (20, 1, True, True),
+        (20, 20, True, False),
+        (5, 0, False, False),
+        (2, 1, False, True),
+    ],
+)
+def test_a_path_is_straight_for_the_tissue_unless_the_probe_turns_or_slides_far(
+    rehearsal, shift_mm, turn_deg, is_free, is_straight
+):
+    """A point beside a probe that turns by 20 degrees on 20 mm is a millimetre off the chord of its path."""
+    organ, pose = rehearsal.organ, rehearsal.organ.pose.copy()
+    pose[:3, :3] = Rotation.from_euler("x", turn_deg, degrees=True).as_matrix() @ pose[:3, :3]
+    pose[0, 3] += shift_mm
+    start = organ._start_of_path(pose, is_free)
+    assert start is (organ.pose if is_straight else pose)
