@@ -149,3 +149,13 @@ def test_the_same_goals_give_the_same_bits(one_device):
             pose = proxy.pose_towards(pose, goal, MOST_MM)
         goals.append(pose.tobytes())
     assert goals[0] == goals[1]
+
+
+def test_what_presses_is_a_smaller_tool_and_what_touches_the_whole(one_device):
+    """The floor is as deep as the smaller tool's face is inside, and the depth that it may have."""
+    points, above, goal = floor(), lifted(SIZE_MM[2] / 2 + 1.0), lifted(SIZE_MM[2] / 2 - 1.5)
+    proxy = Proxy(Points(points), tool(), inset_mm=0.3, radius_mm=1.5)
+    pressed, touching = (proxy.pose_towards(above, goal, *how) for how in ((MOST_MM, True), (0.0, False)))
+    for pose, depth_mm in ((pressed, 0.3 + MOST_MM), (touching, 0.0)):
+        # It retreats no further than it must.
+        assert depth_of(pose, points) == pytest.approx(depth_mm, abs=2 * TOLERANCE_MM)
