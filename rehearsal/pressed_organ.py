@@ -39,7 +39,7 @@ from ultrasound.probe_manipulator import advanced, array_face_centre, poses_betw
 
 AWAY_MM = 200.0
 # How deep what presses of the probe may move into the tissue in a step, before the tissue yields.
-MOST_PENETRATION_MM = 0.4
+MOST_PENETRATION_MM = 0.25
 # Round tissue the proxy's path is bent. Of a longer one the solver, for which a path is straight, has the end
 # alone.
 MOST_STRAIGHT_MM = 3.0
@@ -215,12 +215,16 @@ class PressedOrgan:
         """Advance one time step, in which the transducer follows a hand at a pose (4, 4) as far as the tissue
         lets it; unless it ``presses``, it only touches.
 
-        ``notice`` is the message of the divergence check if it restored the state, else empty.
+        ``notice`` is the message of the divergence check if it restored the state, else empty. The transducer
+        then has moved back along its axis to where it touches.
         """
         pose = self._proxy_of(hand, presses)
         path = poses_between(self._start_of_path(pose, pose is hand), pose, self.settings.substeps)
         self.solver.step(self.settings, path)
         self.notice = self.divergence_check.check(self.settings.time_step_s)
+        if self.notice:
+            # The restored tissue may be where the transducer is now.
+            pose = self.proxy.pose_towards(advanced(pose, -AWAY_MM), pose, 0.0, presses=False)
         self.pose, self.hand = pose, hand
         self.steps += 1
 

@@ -35,6 +35,9 @@ class ShapeContacts:
     applies to them: |friction| <= coefficient * normal. With coefficient 0, ``push`` does not exist.
     """
 
+    # A proxy tests each particle by itself.
+    block = 1
+
     def __init__(self, body: ParticleBody, shapes: list, friction: float) -> None:
         check_count(shapes)
         self.body = body
@@ -77,10 +80,9 @@ class ShapeContacts:
         return tm.vec4(self.body.position[i], self.body.contact_radius[i])
 
     @ti.func
-    def may_be_within(self, i, place, reach):
-        """Whether particle i is within a reach [mm] of a place."""
-        reach += self.body.contact_radius[i]
-        return (self.body.position[i] - place).norm_sqr() < reach * reach
+    def block_ball(self, i):
+        """A ball with particle i in it: middle and radius [mm]."""
+        return self.surface_ball(i)
 
     @ti.func
     def is_clear(self, s: ti.template(), i, p, distance):

@@ -10,57 +10,81 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import Body
-from sim.fields import array_of, fill_evenly, zeros
+from sim.fields import array_of, fill, fill_evenly, zeros
 from sim.lattice import Lattice
 from sim.proxy import Proxy
 from sim.shapes import ConvexTool
 from sim.surface_points import SurfacePoints
 
 # Spacing of the points.
-BARRIER_SPACING_MM = 1.0
+BARRIER_SPACING_MM = 0.7
 # How far the smaller tool's faces are inside the tool, in widths of a cell: wide elements follow its edges
 # less. With less, the barrier would bear a part of presses that are right without it (docs/accuracy.md).
 INSET_CELLS = 0.09
-# Radius of the smaller tool's edges. At sharp ones the direction of the force would jump, and the tissue
+# Least radius of the smaller tool's edges. At sharp ones the direction of the force would jump, and the tissue
 # never come to rest.
 RADIUS_MM = 1.5
 # Penalty stiffness over that of the contact points: an edge is borne by few points.
 STIFFNESS_RATIO = 4.0
 # Points farther outside the smaller tool than this do not get into it within a step.
 NEAR_MM = 0.8
-# How far a point may be from the first node of its element in strained tissue, in widths of a cell.
-REACH_CELLS = 3.0
-# Forces are summed in blocks of this many points, in an order that does not depend on threads.
-BLOCK = 64
+# Points are tested, and their forces summed, in blocks of this many neighbours.
+BLOCK = 16
+# In strained tissue, points of a block may be so much farther from its middle than at rest.
+STRETCH = 1.8
 
 
 class PenetrationBarrier(SurfacePoints):
     """Points on the surface, and the tools that they are near to.
 
     plane (tools, p): normal and offset of n . x >= offset [mm]. near (p,): bits of the tools that are near.
-    active (n,): whether a node has such a point. block_load (tools, b): of the points of each block, at the
-    end of the last substep, force [uN], torque about the origin [uN mm] and sum of the normal forces [uN].
-    ``stiffness`` [kPa/mm]: that of the contact points.
+    active (n,): whether a node has such a point. Neighbouring points are a block: middle (b,): the point in
+    its middle; reach (b,): how far [mm] others may be from it; block_is_near (b,): whether a tool is near;
+    block_load (tools, b): of its points, at the end of the last substep, force [uN], torque about the origin
+    [uN mm] and sum of the normal forces [uN]. ``stiffness`` [kPa/mm]: that of the contact points.
     """
+
+    block = BLOCK
 
     def __init__(
         self, body: Body, lattice: Lattice, points: np.ndarray, area_mm2: np.ndarray, tools: list
     ) -> None:
-        super().__init__(body, lattice, points, area_mm2)
+        self.blocks = -(-len(points) // BLOCK)
+        self.middle, self.block_is_near = (zeros(self.blocks, kind=ti.i32) for _ in range(2))
+        self.reach = zeros(self.blocks)
+        super().__init__(body, lattice, *self._in_blocks(points, area_mm2))
         self.tools = list(tools)
-        self.reach_mm, self.inset_mm = REACH_CELLS * lattice.cell_mm, INSET_CELLS * lattice.cell_mm
+        self.inset_mm = INSET_CELLS * lattice.cell_mm
         self.near = zeros(self.count, kind=ti.i32)
         self.active = zeros(body.count, kind=ti.i32)
         self.plane = zeros(len(tools), self.count, 4, within=1)
-        self.blocks = -(-self.count // BLOCK)
         self.block_load = zeros(len(tools), self.blocks, 7, within=1)
         # A thinner tool has no edges of this radius.
-        self.radius_mm = max(0.0, min(RADIUS_MM, *(tool.inner_ball_mm - self.inset_mm for tool in tools)))
+        radius_mm = max(RADIUS_MM, *(tool.edge_radius for tool in tools))
+        self.radius_mm = max(0.0, min(radius_mm, *(tool.inner_ball_mm - self.inset_mm for tool in tools)))
         self.stiffness = 0.0
+
+    def _in_blocks(self, points: np.ndarray, area_mm2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points (p, 3) and areas (p,) in the order of their blocks, whose middle and reach are set."""
+        order = np.concatenate(in_blocks(points, np.arange(len(points))))
+        points = points[order]
+        middle, reach = np.zeros(self.blocks, int), np.zeros(self.blocks)
+        for block in range(self.blocks):
+            first = block * BLOCK
+            own = points[first : first + BLOCK]
+            centre = np.linalg.norm(own - (own.min(axis=0) + own.max(axis=0)) / 2, axis=1).argmin()
+            middle[block] = first + centre
+            reach[block] = STRETCH * np.linalg.norm(own - own[centre], axis=1).max()
+        fill((self.middle, middle), (self.reach, reach))
+        return points, area_mm2[order]
+
+    def set_points(self, lattice: Lattice, points: np.ndarray, area_mm2: np.ndarray) -> None:
+        """Put the points at other places (p, 3) [mm] at rest, with other areas (p,) [mm^2]."""
+        super().set_points(lattice, *self._in_blocks(points, area_mm2))
 
     def reset(self) -> None:
         """Clear forces and what is near; call it after other code has moved the body."""
-        for field in (self.near, self.active, self.block_load):
+        for field in (self.near, self.active, self.block_is_near, self.block_load):
             fill_evenly(field, 0)
 
     def load(self, tool: object) -> np.ndarray:
@@ -79,33 +103,44 @@ class PenetrationBarrier(SurfacePoints):
         return tm.vec4(self.interpolated(self.body.position, q), 0.0)
 
     @ti.func
-    def may_be_within(self, q, place, reach):
-        """Whether point q may be within a reach [mm] of a place."""
-        return (self.body.position[self.node[q][0]] - place).norm_sqr() < (reach + self.reach_mm) ** 2
+    def block_ball(self, block):
+        """A ball with all points of a block in it: middle and radius [mm]."""
+        return tm.vec4(self.interpolated(self.body.position, self.middle[block]), self.reach[block])
 
     @ti.func
     def find(self):
         """The planes of the tools that each point's predicted position is near to."""
         for i in range(self.body.count):
             self.active[i] = 0
-        for q in range(self.count):
-            near = 0
+        for block in range(self.blocks):
+            is_near, middle = 0, self.interpolated(self.body.predicted, self.middle[block])
             for s in ti.static(range(len(self.tools))):
-                if not self.tools[s].is_beyond(self.body.predicted[self.node[q][0]], self.reach_mm):
-                    p = self.interpolated(self.body.predicted, q)
-                    pose = self.tools[s].pose[None]
-                    local = pose[:3, :3].transpose() @ (p - pose[:3, 3])
-                    surface = self.tools[s].inner_surface(local, self.inset_mm, self.radius_mm)
-                    # Deeper points are left to the contact points, which know by which side they came.
-                    if -self.radius_mm < surface.w < NEAR_MM:
-                        self.point[q] = p
-                        normal = pose[:3, :3] @ surface.xyz
-                        self.plane[s, q] = tm.vec4(normal, normal.dot(p) - surface.w)
-                        near |= 1 << s
-            self.near[q] = near
-            if near > 0:
-                for k in ti.static(range(8)):
-                    self.active[self.node[q][k]] = 1
+                if not self.tools[s].is_beyond(middle, NEAR_MM + self.reach[block]):
+                    is_near = 1
+            # Points that are no longer near are so marked.
+            if is_near + self.block_is_near[block] > 0:
+                for q in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.count)):
+                    self.find_tools(q)
+            self.block_is_near[block] = is_near
+
+    @ti.func
+    def find_tools(self, q):
+        """The planes of the tools that point q is near to, and mark its nodes."""
+        near, p = 0, self.interpolated(self.body.predicted, q)
+        for s in ti.static(range(len(self.tools))):
+            pose = self.tools[s].pose[None]
+            local = pose[:3, :3].transpose() @ (p - pose[:3, 3])
+            surface = self.tools[s].inner_surface(local, self.inset_mm, self.radius_mm)
+            # Deeper points are left to the contact points, which know by which side they came.
+            if -self.radius_mm < surface.w < NEAR_MM:
+                self.point[q] = p
+                normal = pose[:3, :3] @ surface.xyz
+                self.plane[s, q] = tm.vec4(normal, normal.dot(p) - surface.w)
+                near |= 1 << s
+        self.near[q] = near
+        if near > 0:
+            for k in ti.static(range(8)):
+                self.active[self.node[q][k]] = 1
 
     @ti.func
     def depth(self, s: ti.template(), q):
@@ -145,9 +180,10 @@ class PenetrationBarrier(SurfacePoints):
     def finish(self):
         """End of a substep: sum the forces of each block."""
         for block in range(self.blocks):
+            end = ti.min((block + 1) * BLOCK, self.count) if self.block_is_near[block] > 0 else 0
             for s in ti.static(range(len(self.tools))):
                 force, torque, size = tm.vec3(0.0), tm.vec3(0.0), 0.0
-                for q in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.count)):
+                for q in range(block * BLOCK, end):
                     depth = self.depth(s, q)
                     if depth > 0.0:
                         pressed = 1e3 * STIFFNESS_RATIO * self.stiffness * self.area[q] * depth
@@ -157,3 +193,13 @@ class PenetrationBarrier(SurfacePoints):
                 for k in ti.static(range(3)):
                     self.block_load[s, block][k], self.block_load[s, block][k + 3] = force[k], torque[k]
                 self.block_load[s, block][6] = size
+
+
+def in_blocks(points: np.ndarray, which: np.ndarray) -> list[np.ndarray]:
+    """Some of points (p, 3) [mm], their numbers (n,), in blocks of BLOCK neighbours; the last has the rest."""
+    if len(which) <= BLOCK:
+        return [which]
+    axis = np.ptp(points[which], axis=0).argmax()
+    which = which[np.argsort(points[which, axis], kind="stable")]
+    half = BLOCK * -(-len(which) // (2 * BLOCK))
+    return in_blocks(points, which[:half]) + in_blocks(points, which[half:])

@@ -112,11 +112,13 @@ class Proxy:
     @ti.func
     def gather_near(self, length):
         """The points that the tool may touch on a path of a length [mm]: their number."""
-        middle, count = self.start[None][:3, 3], 0
-        for q in range(self.surface.count):
-            if self.surface.may_be_within(q, middle, self.tool.ball_mm + length):
-                self.near[count] = self.surface.surface_ball(q)
-                count += 1
+        pose, count, size = self.start[None], 0, self.surface.block
+        for block in range((self.surface.count + size - 1) // size):
+            ball = self.surface.block_ball(block)
+            if not self.tool.is_beyond_at(pose, ball.xyz, ball.w + length + MOST_AXIAL_MM):
+                for q in range(block * size, ti.min((block + 1) * size, self.surface.count)):
+                    self.near[count] = self.surface.surface_ball(q)
+                    count += 1
         return count
 
     @ti.func
@@ -142,9 +144,9 @@ class Proxy:
                 nearest, local = self.deepest(pose, retreat, count, inset, radius)
                 clearance = nearest.w + most_mm
                 if clearance < 0.0 and projection < PROJECTIONS:
-                    axial = self.tool.depth_along_axis(local) - inset - most_mm
+                    axial = self.tool.way_out(local.xyz, inset, radius, most_mm - local.w)
                     if axial < MOST_AXIAL_MM:
-                        retreat += (ti.max(axial, 0.0) + ROUNDING_MM) * pose[:3, 2]
+                        retreat += (axial + ROUNDING_MM) * pose[:3, 2]
                     else:
                         retreat += (clearance - ROUNDING_MM) * (pose[:3, :3] @ nearest.xyz)
         return tm.vec4(retreat, clearance)
@@ -152,10 +154,10 @@ class Proxy:
     @ti.func
     def deepest(self, pose, retreat, count, inset: float, radius: float):
         """The point that is deepest in the tool: the tool's outward normal and signed distance [mm] there,
-        and its place, in the tool's own frame.
+        and its place and radius, in the tool's own frame.
         """
         rotation, middle = pose[:3, :3], pose[:3, 3] + retreat
-        nearest, place = tm.vec4(0.0, 0.0, 0.0, FAR), tm.vec3(0.0)
+        nearest, place = tm.vec4(0.0, 0.0, 0.0, FAR), tm.vec4(0.0)
         for k in range(count):
             point = self.near[k]
             offset = point.xyz - middle
@@ -167,6 +169,6 @@ class Proxy:
                     local = rotation.transpose() @ offset
                     surface = self.tool.inner_surface(local, inset, radius)
                     if surface.w - point.w < nearest.w:
-                        nearest, place = tm.vec4(surface.xyz, surface.w - point.w), local
-                        place.z += point.w
+                        nearest = tm.vec4(surface.xyz, surface.w - point.w)
+                        place = tm.vec4(local, point.w)
         return nearest, place

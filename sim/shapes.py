@@ -31,6 +31,8 @@ IMPACT_DEPTH_MM = 1.0
 # Each step of sphere tracing is as long as the clearance; only paths along a surface need many.
 TRACING_STEPS = 32
 LEAST_STEP_MM = 0.01
+# Of Newton's method for the way out of a tool along its axis.
+WAY_OUT_ITERATIONS = 4
 
 
 class StaticShape:
@@ -210,7 +212,11 @@ class ConvexTool:
 
     @ti.func
     def is_beyond(self, p, distance):
-        pose = self.pose[None]
+        return self.is_beyond_at(self.pose[None], p, distance)
+
+    @ti.func
+    def is_beyond_at(self, pose, p, distance):
+        """``is_beyond`` with the tool at a pose."""
         from_middle = p - pose[:3, 3]
         beyond = from_middle.norm_sqr() > (self.ball_mm + distance) ** 2
         if not beyond:
@@ -262,14 +268,22 @@ class ConvexTool:
         return tm.vec4(normal, depth - radius)
 
     @ti.func
-    def depth_along_axis(self, local):
-        """How far [mm] the tool must move along its z axis until a point in it is outside; local to it."""
-        depth = FAR
+    def way_out(self, local, inset: float, radius: float, depth: float):
+        """How far [mm] the tool must move along its z axis until a point, local to it, is no deeper than a
+        depth [mm] in ``inner_surface``; 0 where it is not.
+        """
+        way = FAR
         for k in range(self.count):
             plane = self.half_space[k]
             if plane.z < -1e-3:
-                depth = ti.min(depth, (plane.w + self.edge_radius - plane.xyz.dot(local)) / -plane.z)
-        return depth
+                offset = plane.w + self.edge_radius - inset - depth
+                way = ti.min(way, (offset - plane.xyz.dot(local)) / -plane.z)
+        # The distance is convex along the axis: Newton's method from outside stays there.
+        for _ in range(WAY_OUT_ITERATIONS):
+            surface = self.inner_surface(local - tm.vec3(0.0, 0.0, way), inset, radius)
+            if surface.z < -1e-3:
+                way += ti.max(surface.w + depth, 0.0) / surface.z
+        return ti.max(way, 0.0)
 
     @ti.func
     def entered(self, start, p, least_mm: float):

@@ -11,12 +11,14 @@ from small_bead_case import briefly, small_anatomy
 from rehearsal.case import case_of
 from rehearsal.loop.command import Move
 from rehearsal.loop.frame import Step
+from rehearsal.measurements.tumour_measurements import penetration_of
 from rehearsal.notices import Notices
 from rehearsal.pressed_organ import COUPLING_N_MM, MOST_PENETRATION_MM, PressedOrgan, within_force
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.packed_arrays import unpack_wrenches
 from rehearsal.sessions.recorder import SessionRecorder, header_of
 from scenes.scene import with_options
+from sim.body import BodyState
 from ultrasound.probe_manipulator import array_face_centre
 
 pytestmark = pytest.mark.usefixtures("arrays_stored")
@@ -110,11 +112,28 @@ def test_a_goal_is_moved_by_what_the_force_has_left():
     near = within_force(pose, goal, np.array([0, 0, 8.0]), 10.0)
     assert near[:3, 3] == pytest.approx([0.5, 0.0, -2 / COUPLING_N_MM])
     # Beyond the limit it retreats, at most by what a step may move in.
-    over = within_force(pose, pose, np.array([0, 0, 12.0]), 10.0)
-    assert over[:3, 3] == pytest.approx([0, 0, 2 / COUPLING_N_MM])
+    over = within_force(pose, pose, np.array([0, 0, 11.0]), 10.0)
+    assert over[:3, 3] == pytest.approx([0, 0, 1 / COUPLING_N_MM])
     far = within_force(pose, pose, np.array([0, 0, 99.0]), 10.0)
     assert far[:3, 3] == pytest.approx([0, 0, MOST_PENETRATION_MM])
     assert (pose == np.eye(4)).all()
+
+
+def test_tissue_that_is_restored_under_the_probe_has_the_probe_outside(rehearsal):
+    """The state at rest comes back where the probe is 6 mm inside it."""
+    pressed(rehearsal, 6.0)
+    organ, hand = rehearsal.organ, rehearsal.pose_at_depth(6.0)
+    state = organ.body.snapshot()
+    organ.body.restore(BodyState(np.full_like(state.position, np.nan), state.velocity))
+    (step,) = rehearsal.do(Move(pose=hand)).steps
+    rehearsal.show()
+    assert "restored" in organ.notice and (step.hand == hand).all()
+    assert penetration_of(rehearsal.anatomy) < 0.1
+    way = organ.pose[:3, 3] - hand[:3, 3]
+    assert 5.5 < way @ hand[:3, 2] < 6.5 and way == pytest.approx((way @ hand[:3, 2]) * hand[:3, 2], abs=0.1)
+    # It presses again as it did.
+    after = pressed(rehearsal, 6.0)[-1]
+    assert after.wrench[:3] @ hand[:3, 2] > 0.5 and (after.pose == after.hand).all()
 
 
 def test_a_hand_that_only_touches_presses_nothing(rehearsal):

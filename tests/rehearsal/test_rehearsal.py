@@ -71,9 +71,9 @@ def rehearsal(built) -> Rehearsal:
 
 
 def press(rehearsal: Rehearsal) -> None:
-    """The scripted press, in 31 steps."""
-    for step in range(31):
-        rehearsal.advance(rehearsal.scripted_pose(step / 30 * script_length_s(rehearsal.case)))
+    """The scripted press, in 31 steps, and as many until the tissue has yielded."""
+    for step in range(61):
+        rehearsal.advance(rehearsal.scripted_pose(min(step / 30, 1.0) * script_length_s(rehearsal.case)))
     rehearsal.show()
 
 

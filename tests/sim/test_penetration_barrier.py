@@ -12,7 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from sim.fields import array_of
 from sim.lattice import surface_points
-from sim.penetration_barrier import BARRIER_SPACING_MM, INSET_CELLS, RADIUS_MM, STIFFNESS_RATIO
+from sim.penetration_barrier import (
+    BARRIER_SPACING_MM,
+    BLOCK,
+    INSET_CELLS,
+    RADIUS_MM,
+    STIFFNESS_RATIO,
+    STRETCH,
+)
 from sim.shapes import ConvexTool, Plane
 from sim.skinning import Skin
 from sim.surface_contact import PENALTY_DEPTH_MM
@@ -97,6 +104,28 @@ def test_each_point_bears_its_depth_in_the_smaller_tool(kept, tissue):
     borne = 1e-3 * STIFFNESS_RATIO * YOUNG_KPA / PENALTY_DEPTH_MM * (area * depth).sum()
     # At rest up to the 0.01 mm/s of the last step.
     assert barrier.load(solver.tool)[6] == pytest.approx(borne, rel=0.01)
+
+
+def test_points_that_a_tool_leaves_bear_nothing(kept, tissue):
+    solver = pressed(tissue, PRESSED_MM, True)
+    barrier = solver.contacts.barrier
+    assert array_of(barrier.near).any() and array_of(barrier.block_is_near).any()
+    solver.step(settings_of(8, gravity=DOWN), np.stack([pose_at(-1.0), pose_at(-60.0)]))
+    assert not array_of(barrier.near).any() and not array_of(barrier.block_load).any()
+
+
+def test_points_put_elsewhere_are_in_blocks_again(kept, tissue):
+    """In another order they bear the same: each block has neighbours alone."""
+    solver = pressed(tissue, PRESSED_MM, True)
+    barrier = solver.contacts.barrier
+    before = barrier.load(solver.tool)
+    points, area = barrier.whole
+    order = np.random.default_rng(1).permutation(len(points))
+    barrier.set_points(solver.model.lattice, points[order], area[order])
+    assert array_of(barrier.reach).max() < STRETCH * BARRIER_SPACING_MM * BLOCK
+    for _ in range(10):
+        solver.step(settings_of(8, gravity=DOWN))
+    assert barrier.load(solver.tool) == pytest.approx(before, rel=0.01, abs=0.05)
 
 
 def test_the_forces_of_the_barrier_are_in_equilibrium(kept, tissue):

@@ -24,6 +24,8 @@ ROUNDING_MM = 1e-4
 class Points:
     """Contact points that do not move, each a ball of a radius."""
 
+    block = 1
+
     def __init__(self, points: np.ndarray, radius_mm: float = 0.0) -> None:
         self.count = len(points)
         self.point = field_of(points, within=1)
@@ -34,8 +36,8 @@ class Points:
         return tm.vec4(self.point[q], self.radius_mm)
 
     @ti.func
-    def may_be_within(self, q, place, reach):
-        return (self.point[q] - place).norm() < reach + self.radius_mm
+    def block_ball(self, q):
+        return self.surface_ball(q)
 
 
 def floor() -> np.ndarray:
@@ -126,6 +128,21 @@ def test_a_wild_hand_brings_it_neither_into_the_tissue_nor_through_it(one_device
         assert np.linalg.norm(corners @ pose[:3, :3].T + pose[:3, 3], axis=1).min() > 23.0
         assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
     assert touched > 30
+
+
+@pytest.mark.parametrize("up", [0.95, 0.8, 0.5])
+def test_at_an_edge_it_retreats_no_further_than_to_where_that_touches(one_device, up):
+    """A point on the rounded edge beside the face, whose normal has this share along the axis."""
+    across = np.sqrt(1 - up**2)
+    place = SIZE_MM / 2 - EDGE_MM + EDGE_MM * np.array([0.0, across, up])
+    point = np.array([[0.0, place[1], -place[2]]])
+    proxy = Proxy(Points(point), tool())
+    goal = np.eye(4)
+    goal[2, 3] = -0.3
+    pose = proxy.pose_towards(at_height(30.0), goal, 0.0)
+    # It touches at the pose in which the point is on its edge; above or below, it does not.
+    assert pose[:2, 3] == pytest.approx([0.0, 0.0], abs=ROUNDING_MM)
+    assert pose[2, 3] == pytest.approx(0.0, abs=0.02)
 
 
 def test_tissue_that_has_moved_into_it_moves_it_out(one_device):
