@@ -21,8 +21,8 @@ BARRIER_SPACING_MM = 0.7
 # How far the smaller tool's faces are inside the tool, in widths of a cell: wide elements follow its edges
 # less. With less, the barrier would bear a part of presses that are right without it (docs/accuracy.md).
 INSET_CELLS = 0.09
-# Least radius of the smaller tool's edges. At sharp ones the direction of the force would jump, and the tissue
-# never come to rest.
+# Least radius of the smaller tool's edges. At sharp ones the direction of the force would jump, and the
+# tissue never come to rest.
 RADIUS_MM = 1.5
 # Penalty stiffness over that of the contact points: an edge is borne by few points.
 STIFFNESS_RATIO = 4.0
@@ -196,7 +196,7 @@ class PenetrationBarrier(SurfacePoints):
 
 
 def in_blocks(points: np.ndarray, which: np.ndarray) -> list[np.ndarray]:
-    """Some of points (p, 3) [mm], their numbers (n,), in blocks of BLOCK neighbours; the last has the rest."""
+    """Some of points (p, 3) [mm], their numbers (n,), in blocks of BLOCK neighbours, the last of the rest."""
     if len(which) <= BLOCK:
         return [which]
     axis = np.ptp(points[which], axis=0).argmax()
