@@ -9,8 +9,8 @@ from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import sagitta
 
 SPACING_MM = 0.75
-# Points along each side of the footprint.
-FOOTPRINT_POINTS = 9
+# Points of the footprint are at most so far apart, and along each side at least so many.
+FOOTPRINT_MM, LEAST_FOOTPRINT = 1.25, 9
 # The surface is in contact where it is nearer to the face than this; contacts prevent more penetration.
 CONTACT_MM = 0.5
 # Barycentric tolerance: no gaps between triangles from rounding.
@@ -44,7 +44,8 @@ def footprint(probe: Probe) -> np.ndarray:
     axes [mm]; on rounded edges.
     """
     half, rounded = np.array(probe.housing_mm) / 2, probe.edge_radius_mm
-    x, y = np.meshgrid(*(h * np.linspace(-1, 1, FOOTPRINT_POINTS) for h in half[:2]))
+    counts = (max(LEAST_FOOTPRINT, 2 * int(np.ceil(h / FOOTPRINT_MM)) + 1) for h in half[:2])
+    x, y = np.meshgrid(*(h * np.linspace(-1, 1, n) for h, n in zip(half[:2], counts, strict=True)))
     points = np.column_stack([x.ravel(), y.ravel(), sagitta(x.ravel(), probe.radius_mm) - half[2]])
     if rounded == 0:
         return points
