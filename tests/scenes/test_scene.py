@@ -303,7 +303,7 @@ def test_a_scenes_probes_file_lies_beside_it(tmp_path, monkeypatch):
         (
             (42.0, 3.0, 20.0),
             None,
-            r"^transducer.size_mm = \[42.0, 3.0, 20.0\] does not fit the probe Drop-in.*CableMm = 3.5",
+            r"^transducer.size_mm = \[42.0, 3.0, 20.0\] does not fit the probe Drop-in.*EdgeRadiusMm = 2",
         ),
         (
             (12.0, 9.0, 6.0),
