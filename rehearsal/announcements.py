@@ -1,7 +1,5 @@
 """Notices of what happened in a frame: undo, bookmarks, refusals, restored states, warnings of a cut."""
 
-from time import perf_counter
-
 from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.loop.command import Bookmark, CutOut, Redo, Undo
 from rehearsal.loop.frame import Applied, Event, Frame, Refused, Step
@@ -9,24 +7,13 @@ from rehearsal.notices import Notices
 from rehearsal.resection.resection_view import warnings_of
 from ultrasound.probe import Probe
 
-# How long the window says that the tissue's state was restored.
-RESTORED_S = 4.0
-
 
 class Announcements:
-    """An ``Observer`` that posts notices; ``has_restored`` for RESTORED_S after the divergence check
-    restored a state.
-    """
+    """An ``Observer`` that posts notices."""
 
     def __init__(self, anatomy: DeformedAnatomy, notices: Notices) -> None:
         self.anatomy, self.notices = anatomy, notices
-        self._restored_until = 0.0
         self._was_paced = False
-
-    @property
-    def has_restored(self) -> bool:
-        """Whether the window says so now."""
-        return perf_counter() < self._restored_until
 
     def observe(self, frame: Frame, probe: Probe) -> None:
         """As ``Observer.observe``."""
@@ -40,8 +27,7 @@ class Announcements:
     def _announce(self, event: Event, frame: Frame) -> None:
         match event:
             case Step() if event.notice:
-                self.notices.post(event.notice, on_screen=False)
-                self._restored_until = perf_counter() + RESTORED_S
+                self.notices.post(event.notice)
             case Refused():
                 self.notices.post(event.reason, in_terminal=not isinstance(event.command, Undo | Redo))
             case Applied(command=Undo() | Redo()):

@@ -120,7 +120,6 @@ class RehearsalRun:
             self.anatomy,
             source,
             self.measurements,
-            announcements,
             self.resection,
             plans,
             self.notices,

@@ -11,7 +11,6 @@ from time import perf_counter
 
 import numpy as np
 
-from rehearsal.announcements import Announcements
 from rehearsal.caliper import Caliper
 from rehearsal.cine import Cine, CineFrame
 from rehearsal.deformed_anatomy import DeformedAnatomy
@@ -20,6 +19,7 @@ from rehearsal.imaging import image_view, readouts
 from rehearsal.live_settings import LiveSettings
 from rehearsal.loop.protocols import Source
 from rehearsal.measurements.live_measurements import LiveMeasurements
+from rehearsal.message_log import MessageLog
 from rehearsal.notices import Notices
 from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.real_time.frame_times import FrameTimes
@@ -34,8 +34,6 @@ from scenes.import_findings import acknowledge
 from scenes.scene import SceneError
 from ultrasound.probe import Probe
 
-# How long a notice stays on the screen.
-NOTICE_S = 2.0
 # The simulation counts as real time from this share of it on.
 REAL_TIME = 0.9
 # What the figures of speed on the screen are of.
@@ -56,7 +54,6 @@ class WindowPanel:
         anatomy: DeformedAnatomy,
         source: Source,
         measurements: LiveMeasurements,
-        announcements: Announcements,
         resection: ResectionView,
         plans: PlanControl,
         notices: Notices,
@@ -68,18 +65,12 @@ class WindowPanel:
         folder: Path = Path(),
     ) -> None:
         self.anatomy, self.source, self.measurements = anatomy, source, measurements
-        self.announcements, self.resection, self.plans, self.notices = (
-            announcements,
-            resection,
-            plans,
-            notices,
-        )
+        self.resection, self.plans, self.notices = resection, plans, notices
         self.out, self.keys, self.counts, self.link = out, keys, counts, link
         self.warnings, self.folder = warnings, folder
         self.sweeping = SweepRecorder(anatomy, notices)
-        self.cine, self.caliper = Cine(), Caliper()
+        self.cine, self.caliper, self.messages = Cine(), Caliper(), MessageLog()
         self._frozen = False
-        self._notice, self._notice_until = "", 0.0
 
     @property
     def shows_earlier(self) -> bool:
@@ -103,6 +94,8 @@ class WindowPanel:
         if controls.reset:
             self.caliper.points = ()
         self.notices.post(controls.message)
+        if controls.dismiss:
+            self.messages.dismiss()
         if controls.acknowledge and self.warnings:
             self._try(self._acknowledge)
         self.plans.control(controls)
@@ -138,6 +131,8 @@ class WindowPanel:
             clock=f"{time_s:.1f} s",
             pace=self._pace(times),
             status=self._status(view, settings),
+            messages=self.messages.shown(perf_counter()),
+            log=tuple((f"{at_s:.0f} s", text) for at_s, text in self.messages.kept),
             notes={name: self._with_hint(note) for name, note in view.notes.items()},
         )
 
@@ -192,11 +187,8 @@ class WindowPanel:
 
     def _status(self, view: View, settings: LiveSettings) -> str:
         """The text over the images, the most important first: text that does not fit is cut at the end."""
-        restored = "STATE RESTORED" if self.announcements.has_restored else ""
-        is_new = perf_counter() < self._notice_until
-        news = [self._notice] if is_new else [self._state(), self.plans.status]
         score = self.resection.status(cut_settings(settings))
-        parts = [restored, view.status, self.sweeping.status, *news, score]
+        parts = [view.status, self.sweeping.status, self._state(), self.plans.status, score]
         return self.keys.worded("   ".join(filter(None, parts)))
 
     def _state(self) -> str:
@@ -205,9 +197,9 @@ class WindowPanel:
         return f"FROZEN   {self.cine.age_s:.1f} s" if self.cine.back else "FROZEN"
 
     def _show_notices(self) -> None:
-        """Show the notices of this frame in the panel and in the terminal."""
+        """Show the notices of this frame under the 3D view and in the terminal."""
         for text in self.notices.present(self.keys.worded):
-            self._notice, self._notice_until = text[0].upper() + text[1:], perf_counter() + NOTICE_S
+            self.messages.add(text[0].upper() + text[1:], self.anatomy.frame.time_s)
 
     def _try(self, write: Callable[[], None]) -> None:
         """Write files that the user asked for."""
@@ -236,8 +228,7 @@ class WindowPanel:
             missing.append("no organ (PLY), which has moved since: {freeze} continues")
         else:
             save_surfaces(self.anatomy, self.out, begin)
-        self.notices.post("   ".join([f"saved {begin.rstrip('-')}", *missing]), in_terminal=False)
-        self.notices.post("; ".join(missing), on_screen=False)
+        self.notices.post("; ".join([f"saved {begin.rstrip('-')}", *missing]))
 
 
 def _speeds(times: FrameTimes) -> dict[str, str]:

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from render.keys import Keys, default_keys
+from render.message_box import log_image, message_image
 from render.text import fitting_size, font, shortened
 from render.ultrasound_panel import (
     ALERT,
@@ -72,9 +73,12 @@ class BackgroundImage:
         self._view: View | None = None
         self._taken = 0
         self._backdrop: tuple = ()
-        self.has_scene = self._shows_help = False
+        self.has_scene = False
+        # The page over everything, with what is on it; empty without one.
+        self._page: tuple = ()
         self._axes: np.ndarray | None = None
         self._status: str | None = None
+        self._messages: tuple[str, ...] | None = None
         self._figures: Figures | None = None
         self._figures_at = 0.0
 
@@ -104,9 +108,9 @@ class BackgroundImage:
             view.warnings,
             taken,
         )
-        if self._shows_help or self._backdrop != parts:
+        if self._page or self._backdrop != parts:
             self._rows[:, :, :3] = backdrop(self.layout, view, self.keys.of["help"])
-            self._figures, self._axes, self._status, self._shows_help = None, None, None, False
+            self._figures, self._axes, self._status, self._messages, self._page = None, None, None, None, ()
             self._empty_scene, self.has_scene = self._scene.copy(), False
         self._view, self._backdrop, self._taken = view, parts, taken
         for (name, image), box in zip(view.shown.items(), image_boxes(self.layout, view), strict=True):
@@ -115,6 +119,9 @@ class BackgroundImage:
         if view.status != self._status:
             self._put(self.layout.status, status_image(self.layout, view.status))
             self._status = view.status
+        if view.messages != self._messages:
+            self._put(self.layout.messages, message_image(self.layout, view.messages))
+            self._messages = view.messages
         figures = dict(view.readouts), findings, view.alert, view.clock, view.pace
         self._compose_figures(figures, slow_figures)
         if self._axes is None or not np.array_equal(axes, self._axes):
@@ -153,11 +160,14 @@ class BackgroundImage:
         """Draw what is being prepared, until the first ``compose``."""
         self._put(self.layout.whole, progress_image(self.layout, text))
 
-    def show_help(self) -> None:
-        """Draw the list of all keys over everything, until the next ``compose``."""
-        if not self._shows_help:
-            self._put(self.layout.whole, help_image(self.layout, self.keys.lines()))
-            self._shows_help = True
+    def show_page(self, name: str, view: View) -> None:
+        """Draw a page (``keys.PAGES``) over everything, until the next ``compose``."""
+        page = (name, view.log) if name == "log" else (name,)
+        if self._page != page:
+            is_log = name == "log"
+            shown = log_image(self.layout, view.log) if is_log else help_image(self.layout, self.keys.lines())
+            self._put(self.layout.whole, shown)
+            self._page = page
 
     def _draw_over(self, view: View, name: str, box: Rect) -> None:
         """Draw outlines, note and caliper over an image."""
@@ -180,7 +190,8 @@ class BackgroundImage:
         readouts, findings, alert, clock, pace = figures
         box = clock_box(self.layout, self.keys.of["help"])
         self._put(box, clock_image(self.layout, box, clock, pace))
-        self._put(self.layout.readouts, readout_image(self.layout, readouts))
+        if self.layout.readouts.width:
+            self._put(self.layout.readouts, readout_image(self.layout, readouts))
         if findings:
             box = self.layout.findings(len(findings))
             self._put(box, findings_image(self.layout, findings, alert))
@@ -191,7 +202,7 @@ class BackgroundImage:
 
     def plane_point_at(self, column: float, row: float) -> tuple[float, float] | None:
         """The point of the image plane [mm] at a pixel of one of the images, None elsewhere."""
-        if self._view is None or self._shows_help:
+        if self._view is None or self._page:
             return None
         hit = (box for box in image_boxes(self.layout, self._view) if box.contains(column, row))
         return next((to_plane(self._view, box, column, row) for box in hit), None)

@@ -66,6 +66,7 @@ KEY_MAP = {
         "reset tissue, transducer and view": {"reset": "R"},
         "save a screenshot of the window": {"screenshot": "P"},
         "show or hide this list": {"help": "H"},
+        "show or hide the messages of the session": {"log": "Shift+H"},
         "quit": {"quit": "Esc"},
     },
 }
@@ -96,8 +97,9 @@ HELD = {
 # The others act when the key goes down: cine steps, settings with a key, and controls with the name of the
 # action.
 STEPS = {"cine_back": -1, "cine_forth": 1}
-# Actions of the 3D view itself.
+# Actions of the 3D view itself, and pages over the whole window.
 VIEW_ACTIONS = ("zoom_in", "zoom_out")
+PAGES = ("help", "log")
 
 SECTIONS = "unknown key; expected the sections [keys] and [gamepad]"
 HEAD = """\
@@ -186,7 +188,7 @@ def load_keys(path: Path, usual: Keys) -> Keys:
     except ValidationError as error:
         raise KeysError(f"{path}: {explained(error, lambda _: SECTIONS)}") from None
     mouse = usual.of.keys() - usual.keyed.keys()
-    buttons = [action for action in usual.keyed if action not in (*VIEW_ACTIONS, "help")]
+    buttons = [action for action in usual.keyed if action not in (*VIEW_ACTIONS, *PAGES)]
     try:
         return replace(
             usual,

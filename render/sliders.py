@@ -1,5 +1,5 @@
-"""Sliders, switches and buttons of the settings that have a ``Control``: in the strip under the 3D view; the
-scanner's beside the panel.
+"""Sliders, switches and buttons of the settings that have a ``Control``: an engineer's in the strip under the
+3D view; the scanner's and those of a resection beside the panel.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ from render.viewer import (
 from render.window_layout import Rect, WindowLayout
 from settings import Setting, live_settings, section_of, value_of, with_values
 
-# Groups in the strip, in their order; where these are too wide, the first are left out.
+# An engineer's groups, in the strip, in their order; where these are too wide, the first are left out.
 STRIP = ("Tissue", "Image", "View")
 # Dear ImGui's glyphs are 7 pixels wide, its rows 23 pixels high. A slider's label gets 35 % of a box, that of
 # a switch or a button all of it, less these pixels around them.
@@ -50,12 +50,14 @@ def boxes_of(settings: WindowSettings, geometry: Geometry, layout: WindowLayout)
     Where boxes would be too narrow for their labels, the first are left out.
     """
     groups = groups_of(settings, geometry)
-    widths = {name: _width(settings, groups[name]) for name in STRIP if name in groups}
+    in_strip = STRIP if settings.view.show_engineer else ()
+    widths = {name: _width(settings, groups[name]) for name in in_strip if name in groups}
     while len(widths) > 1 and sum(widths.values()) > layout.slider_room(len(widths)):
         del widths[next(iter(widths))]
     boxes = dict(zip(widths, layout.sliders(list(widths.values())), strict=True))
     names = [RESECTION] if settings.resection.show_resection else []
     if settings.view.show_scanner:
+        names += [] if settings.view.show_engineer else ["Image"]
         names += [B_MODE, TGC if settings.scanner.doppler == "off" else DOPPLER]
     return boxes | _beside_panel(settings, {name: groups[name] for name in names}, layout)
 

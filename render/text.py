@@ -45,6 +45,18 @@ def shortened(text: str, size: int, width: int) -> str:
     return line.rstrip() + "..."
 
 
+def wrapped(text: str, size: int, width: int) -> list[str]:
+    """The lines of a text that are no wider than so many pixels; a longer word has a line of its own."""
+    lines, line = list[str](), ""
+    for word in text.split():
+        longer = f"{line} {word}".strip()
+        if line and font(size).getlength(longer) > width:
+            lines.append(line)
+            longer = word
+        line = longer
+    return [*lines, line]
+
+
 @lru_cache(maxsize=64)
 def _coverage(text: str, size: int) -> np.ndarray:
     """The covered fraction of each pixel of a text, (rows, columns, 1), with a border."""

@@ -17,7 +17,6 @@ Technique = Literal["enucleation", "enucleoresection", "wedge"]
 # Groups of controls beside the image, as on a scanner: TGC or Doppler, and those of a resection, where the
 # user asks for them.
 B_MODE, TGC, DOPPLER, RESECTION = "B-mode", "TGC", "Doppler", "Resection"
-SCANNER_GROUPS = (B_MODE, TGC, DOPPLER, RESECTION)
 
 
 class ViewSettings(Section):
@@ -33,6 +32,9 @@ class ViewSettings(Section):
     show_parts: Annotated[bool, Control("Vessels", "View")] = True
     show_support: Annotated[bool, Control("Support", "View")] = True
     show_scanner: Annotated[bool, Key("G", "Image", "the scanner's sliders, with TGC")] = False
+    show_engineer: Annotated[
+        bool, Key("Shift+E", "View", "an engineer's sliders and figures: tissue, steps, speed")
+    ] = False
     outline: Annotated[
         bool, Control("Outline", "View"), Key("O", "Image", "outline of the tumour, now and in the CT")
     ] = False
@@ -199,6 +201,10 @@ class View:
     """The session's time, in simulated seconds: "42.6 s"."""
     pace: str = ""
     """Its rate, where slower than real time: "0.2 x real"."""
+    messages: tuple[str, ...] = ()
+    """Messages to the user, the oldest first."""
+    log: tuple[tuple[str, str], ...] = ()
+    """All messages of the session, each with its time before it: ("42.6 s", "Bookmark 1")."""
     warnings: tuple[str, ...] = ()
     """Warnings that nobody has acknowledged, of the import."""
     title: str = ""
@@ -258,6 +264,8 @@ class Controls(Generic[UserSettings]):
     """Replace the marks of the score by those of the planned line."""
     cut_out: bool = False
     """Cut along the score."""
+    dismiss: bool = False
+    """The messages on the screen were read: the user clicked on them."""
     acknowledge: bool = False
     """The warnings of the import were checked."""
     cine: int = 0

@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 from PIL import Image, ImageDraw
 
-from render.text import font
+from render.text import font, wrapped
 from render.ultrasound_panel import ALERT, FINDINGS
 from render.window_layout import FIGURE_HEIGHT, Rect, WindowLayout
 
@@ -24,17 +24,8 @@ def warning_rect(layout: WindowLayout, warnings: tuple[str, ...], taken: int = 0
 @lru_cache(maxsize=8)
 def warning_lines(layout: WindowLayout, warnings: tuple[str, ...], taken: int = 0) -> list[str]:
     """The lines of some warnings; of very long ones the last lines are left out."""
-    letters, room = font(layout.px(LETTERS_PX)), _room(layout, taken).width - 2 * layout.px(10)
-    lines: list[str] = []
-    for warning in warnings:
-        line = ""
-        for word in warning.split():
-            longer = f"{line} {word}".strip()
-            if line and letters.getlength(longer) > room:
-                lines.append(line)
-                longer = word
-            line = longer
-        lines.append(line)
+    room = _room(layout, taken).width - 2 * layout.px(10)
+    lines = [line for warning in warnings for line in wrapped(warning, layout.px(LETTERS_PX), room)]
     most = max(
         1, (layout.foot.bottom - layout.highest_warning - 2 * layout.figures_pad) // layout.px(FIGURE_HEIGHT)
     )

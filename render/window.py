@@ -12,6 +12,7 @@ The only file that uses ti.ui. A frame is drawn in this order:
 import atexit
 import time
 from collections import Counter
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Generic
@@ -24,11 +25,11 @@ from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
 from render.display import display_available
 from render.gamepad import Gamepad
 from render.graphics_scene import GraphicsScene
-from render.keys import Keys, begin, default_keys, hold
+from render.keys import PAGES, Keys, begin, default_keys, hold
 from render.scene_view import SceneView
 from render.sliders import boxes_of, draw_sliders
 from render.software_scene import SoftwareScene
-from render.viewer import SCANNER_GROUPS, Controls, Geometry, UserSettings, View
+from render.viewer import Controls, Geometry, UserSettings, View
 from render.vulkan_device import draws_by_processor
 from render.window_layout import FULL_SIZE, Rect, WindowLayout
 from sim.device import on_cpu
@@ -92,7 +93,8 @@ class Window(Generic[UserSettings]):
         self._gui = self._window.get_gui()
         self._view: View | None = None
         self._quit = False
-        self._help_shown = False
+        # The page over the whole window, if any.
+        self._page = ""
         self._warm_up = 2
         self._drag: str | None = None
         self._cursor: np.ndarray | None = None
@@ -199,7 +201,7 @@ class Window(Generic[UserSettings]):
 
     def _boxes_over_scene(self) -> list[Rect]:
         """The boxes of the background image that cover the 3D view."""
-        if self._help_shown:
+        if self._page:
             return [self.layout.whole]
         if self._view is None:
             return [self.layout.compass]
@@ -232,8 +234,9 @@ class Window(Generic[UserSettings]):
             controls.score_under = self.camera.ray(self._cursor)
         elif key == ti.ui.LMB:
             self._pressing = self._over_scene()
-            if self._cursor is not None and not self._help_shown:
+            if self._cursor is not None and not self._page:
                 place = self._pixel(self._cursor)
+                controls.dismiss = self.layout.messages.contains(*place)
                 controls.pointed_mm = self._background.plane_point_at(*place)
                 boxes = self._slider_boxes.items()
                 pressed = [name for name, box in boxes if box.widened(BOX_EDGE_PX).contains(*place)]
@@ -241,8 +244,8 @@ class Window(Generic[UserSettings]):
         elif key in (ti.ui.RMB, ti.ui.MMB) and self._over_scene():
             pans = key == ti.ui.MMB or with_shift
             self._drag = "pan" if pans else "orbit"
-        elif (action := self.keys.action_of(key, with_shift)) == "help":
-            self._help_shown = not self._help_shown
+        elif (action := self.keys.action_of(key, with_shift)) in PAGES:
+            self._page = "" if self._page == action else action
         else:
             begin(action, controls)
 
@@ -266,7 +269,7 @@ class Window(Generic[UserSettings]):
         """Where the processor draws the 3D view, draw it already, for the next `draw`; with `may_wait`
         only if the user changed it.
         """
-        if self._software is not None and not self._help_shown and self._background.has_scene:
+        if self._software is not None and not self._page and self._background.has_scene:
             self._is_ahead = True
             if not self._keeps_scene(may_wait):
                 self._draw_by_processor(self._software, view)
@@ -313,10 +316,12 @@ class Window(Generic[UserSettings]):
         atexit.unregister(self.close)
 
     def _update_size(self) -> None:
-        size = self._window.get_window_shape()
-        if tuple(size) == (self.layout.width, self.layout.height) or min(size) < 200:
-            return
-        self.layout = WindowLayout(*size)
+        width, height = self._window.get_window_shape()
+        if (width, height) != (self.layout.width, self.layout.height) and min(width, height) >= 200:
+            self._change_layout(replace(self.layout, width=width, height=height))
+
+    def _change_layout(self, layout: WindowLayout) -> None:
+        self.layout, size = layout, (layout.width, layout.height)
         self._background = BackgroundImage(self.layout, self.keys)
         if self._software is not None:
             self._software = SoftwareScene(self.camera, size)
@@ -324,9 +329,11 @@ class Window(Generic[UserSettings]):
         self.camera.part = self.layout.window_coordinates(self.layout.clear)
 
     def _draw_frame(self, view: View) -> None:
-        if self._help_shown:
-            self._background.show_help()
+        if self._page:
+            self._background.show_page(self._page, view)
         else:
+            if self.layout.with_tools != self.settings.view.show_engineer:
+                self._change_layout(replace(self.layout, with_tools=self.settings.view.show_engineer))
             self._place_sliders()
             self._background.compose(view, np.stack(self.camera.axes()), self._taken(), self._visible)
             keeps = self._is_ahead or self._keeps_scene()
@@ -336,7 +343,7 @@ class Window(Generic[UserSettings]):
         self._put_image()
         if self._software is None:
             self._draw_scene(view)
-        if not self._help_shown:
+        if not self._page:
             placed = self._slider_boxes, self._first_size, self._boxes_moved
             self.settings = draw_sliders(self._gui, self.settings, self._geometry, *placed)
 
@@ -349,8 +356,8 @@ class Window(Generic[UserSettings]):
     def _taken(self) -> int:
         """The width that the scanner's sliders take beside the warnings."""
         scene, warned = self.layout.scene, self.layout.highest_warning
-        boxes = [box for name, box in self._slider_boxes.items() if name in SCANNER_GROUPS]
-        return max((scene.right - box.left for box in boxes if box.bottom > warned), default=0)
+        beside = [box for box in self._slider_boxes.values() if warned < box.bottom <= scene.bottom]
+        return max((scene.right - box.left for box in beside), default=0)
 
     def _put_image(self) -> None:
         # Without the 10 ms that Canvas.set_image needs to pack the pixels.

@@ -9,7 +9,8 @@ import numpy as np
 # read-outs below it.
 PANEL_SHARE = 0.43
 TITLE_HEIGHT, CLOCK_WIDTH = 42, 150
-STRIP_HEIGHT, STRIP_GAP, READOUT_WIDTH = 184, 4, 134
+TOOLS_HEIGHT, STRIP_GAP, READOUT_WIDTH = 184, 4, 134
+MESSAGE_LINES, MESSAGE_PITCH = 3, 20
 HEADER_HEIGHT, FOOTER_HEIGHT = 74, 52
 STATUS_MIDDLE, STATUS_HEIGHT = 43, 18
 RULER_WIDTH, WEDGE_WIDTH, IMAGE_GAP, NAME_HEIGHT = 42, 30, 10, 26
@@ -58,10 +59,13 @@ class Rect(NamedTuple):
 
 @dataclass(frozen=True)
 class WindowLayout:
-    """The boxes of all parts of a window of width x height pixels."""
+    """The boxes of all parts of a window of width x height pixels, ``with_tools`` also of those for an
+    engineer.
+    """
 
     width: int
     height: int
+    with_tools: bool = False
 
     @property
     def scale(self) -> float:
@@ -97,8 +101,20 @@ class WindowLayout:
 
     @property
     def strip(self) -> Rect:
-        """Sliders and read-outs, beneath the 3D view."""
-        height = min(max(STRIP_HEIGHT, self.px(STRIP_HEIGHT)), self.height // 3)
+        """Messages, and an engineer's sliders and read-outs, beneath the 3D view."""
+        top = self.messages.top - 1
+        return Rect(0, top, self.panel.left, self.height - top)
+
+    @property
+    def messages(self) -> Rect:
+        """The messages, in the upper part of the strip."""
+        height = MESSAGE_LINES * self.px(MESSAGE_PITCH) + self.figures_pad
+        return Rect(0, self.tools.top - height, self.panel.left, height)
+
+    @property
+    def tools(self) -> Rect:
+        """An engineer's sliders and read-outs, in the lower part of the strip."""
+        height = min(max(TOOLS_HEIGHT, self.px(TOOLS_HEIGHT)), self.height // 3) if self.with_tools else 0
         return Rect(0, self.height - height, self.panel.left, height)
 
     @property
@@ -119,8 +135,9 @@ class WindowLayout:
 
     @property
     def readouts(self) -> Rect:
-        width = self.px(READOUT_WIDTH) if self.strip.width >= STRIP_WITH_READOUTS else 0
-        return Rect(self.strip.right - width, self.strip.top, width, self.strip.height)
+        is_wide = self.with_tools and self.strip.width >= STRIP_WITH_READOUTS
+        width = self.px(READOUT_WIDTH) if is_wide else 0
+        return Rect(self.tools.right - width, self.tools.top, width, self.tools.height)
 
     @property
     def compass(self) -> Rect:
@@ -159,9 +176,9 @@ class WindowLayout:
         return [
             Rect(
                 round(gap * (i + 1) + edges[i]),
-                self.strip.top + gap,
+                self.tools.top + gap,
                 round(edges[i + 1] - edges[i]),
-                min(STRIP_HEIGHT - 2 * STRIP_GAP, self.strip.height - 2 * gap),
+                min(TOOLS_HEIGHT - 2 * STRIP_GAP, self.tools.height - 2 * gap),
             )
             for i in range(len(widths))
         ]

@@ -82,7 +82,7 @@ class SessionRecorder:
                     self._write(StateLine(at=event.number, state=pack_state(event.state), seen=seen))
         if self.fault and not self._has_warned:
             self._has_warned = True
-            self.notices.post(self.fault, on_screen=False)
+            self.notices.post(self.fault)
 
     def note(self, number: int, reading: dict[str, float | None]) -> None:
         """Write measurements in the state of a number."""

@@ -196,9 +196,7 @@ class ReplayCheck:
         self.compared_s, self.digest = time_s, event.digest
         if self.differs_s is None and event.digest != self.log.digests[event.number]:
             self.differs_s = time_s
-            self._notices.post(
-                f"Warning: from {time_s:.0f} s on the tissue differs from the recorded one.", on_screen=False
-            )
+            self._notices.post(f"Warning: from {time_s:.0f} s on the tissue differs from the recorded one.")
 
 
 def open_session(

@@ -130,7 +130,7 @@ class Looping:
         resection = SimpleNamespace(update=lambda *_: None, score=lambda _: None, status=lambda _: "")
         self.plans = SimpleNamespace(status="", control=lambda controls: None)
         self.panel = WindowPanel(
-            *(self.anatomy, self.source, self.measurements, announcements, resection, self.plans),
+            *(self.anatomy, self.source, self.measurements, resection, self.plans),
             *(self.notices, out, DEFAULT_KEYS, {"nodes": 7}, link, warnings),
         )
         observers = [self.measurements, announcements]
@@ -285,14 +285,13 @@ def test_what_is_done_is_said_with_the_frame_in_which_it_was(looping):
     assert said == ["", "undo", "Bookmark 1", "Nothing to undoNothing to undo"]
 
 
-def test_a_restored_state_is_a_notice_and_stands_in_the_panel_for_a_while(looping, capsys):
+def test_a_restored_state_is_a_message_on_the_screen_and_in_the_terminal(looping, capsys):
     looping.stepper.organ.notice = "The tissue was restored"
     looping.next()
     looping.stepper.organ.notice = ""
-    assert looping.next().status.startswith("STATE RESTORED")
+    view = looping.next()
+    assert view.messages == ("The tissue was restored",) and view.status == ""
     assert capsys.readouterr().out.count("The tissue was restored") == 1
-    looping.panel.announcements._restored_until = 0.0
-    assert looping.next().status == ""
 
 
 def test_a_pace_that_differs_is_said_once(tmp_path, capsys):
@@ -308,7 +307,7 @@ def test_a_pace_that_differs_is_said_once(tmp_path, capsys):
 def test_notices_name_the_users_keys_on_the_screen_and_in_the_terminal(looping, capsys):
     looping.panel.keys = replace(DEFAULT_KEYS, of=DEFAULT_KEYS.of | {"sweep": "Space", "plan_for": "L"})
     looping.notices.post("sweep-001: {sweep} ends it")
-    assert looping.next().status == "Sweep-001: Space ends it"
+    assert looping.next().messages == ("Sweep-001: Space ends it",)
     assert capsys.readouterr().out == "sweep-001: Space ends it\n"
 
 
@@ -321,10 +320,19 @@ def test_what_is_wrong_with_the_tissue_stands_before_all_that_is_technical(loopi
     looping.plans.status, looping.source.status = "PLANNING", "REDUCED ITERATIONS"
     assert looping.next().status == "COMPRESSED   RECORDING 3 s   REDUCED ITERATIONS   PLANNING"
     looping.notices.post("undo", in_terminal=False)
-    assert looping.next().status == "COMPRESSED   RECORDING 3 s   Undo"
-    looping.panel._notice_until, looping.panel.announcements._restored_until = 0.0, np.inf
-    status = looping.next(freeze=True).status
-    assert status == "STATE RESTORED   COMPRESSED   RECORDING 3 s   FROZEN   PLANNING"
+    # A message does not take the place of a state.
+    view = looping.next()
+    assert view.messages == ("Undo",)
+    assert view.status == "COMPRESSED   RECORDING 3 s   REDUCED ITERATIONS   PLANNING"
+    assert looping.next(freeze=True).status == "COMPRESSED   RECORDING 3 s   FROZEN   PLANNING"
+
+
+def test_messages_that_were_read_are_in_the_log(looping):
+    for text in ("undo", "another"):
+        looping.notices.post(text, in_terminal=False)
+    assert looping.next().messages == ("Undo", "Another")
+    view = looping.next(dismiss=True)
+    assert view.messages == () and view.log == (("0 s", "Undo"), ("0 s", "Another"))
 
 
 def test_warnings_of_the_import_stay_until_they_are_acknowledged(tmp_path, monkeypatch, capsys):
@@ -348,9 +356,8 @@ def test_warnings_that_cannot_be_acknowledged_stay(tmp_path, monkeypatch, error)
     looping = Looping(tmp_path, warnings=("one",))
     monkeypatch.setattr(window_panel, "acknowledge", fails)
     view = looping.next(acknowledge=True)
-    assert (
-        len(view.warnings) == 2 and view.status == f"Not saved: {getattr(error, 'strerror', None) or error}"
-    )
+    assert len(view.warnings) == 2
+    assert view.messages == (f"Not saved: {getattr(error, 'strerror', None) or error}",)
 
 
 def test_a_frozen_image_keeps_its_caliper_and_a_live_one_until_the_probe_moves(looping):
@@ -428,7 +435,7 @@ def test_the_export_key_saves_the_tissue_beside_its_images_and_says_what_it_cann
     )
     looping.panel.link = None
     looping.next(export=True)
-    assert looping.next().status == "Saved 001" and begins == ["001-"]
+    assert looping.next().messages == ("Saved 001",) and begins == ["001-"]
     assert (tmp_path / "001-b-mode.dcm").is_file()
     looping.panel.cine.frames.append(looping.panel.cine.frames[-1])
     looping.next(freeze=True)
@@ -442,8 +449,9 @@ def test_the_export_key_saves_the_tissue_beside_its_images_and_says_what_it_cann
         "B-mode image black: the probe does not touch the organ",
         "no organ (PLY), which has moved since: F continues",
     )
-    assert looping.next().status == "   ".join(["Saved 002", *missing])
-    assert capsys.readouterr().out.endswith(f"\n{'; '.join(missing)}\n") and begins == ["001-"]
+    said = "; ".join(["saved 002", *missing])
+    assert said.capitalize()[:9] + said[9:] in looping.next().messages
+    assert capsys.readouterr().out.endswith(f"\n{said}\n") and begins == ["001-"]
     # Of the live image all pixels are computed; the earlier one is saved as it was shown.
     assert [view.images["CT"].shape for view in saved] == [(4, 4), looping.viewer.image_shape(2, 1.0, 1.0)]
 

@@ -25,7 +25,7 @@ from render.keys import default_keys
 from render.sliders import boxes_of, groups_of
 from render.text import fitting_size, font, shortened, write
 from render.ultrasound_panel import ALERT, CALIPER, OUTLINE, OUTLINE_AT_REST, QUIET, TEXT, to_plane
-from render.viewer import SCANNER_GROUPS, Geometry, View
+from render.viewer import Geometry, View
 from render.warning_box import warning_lines, warning_rect
 from render.window_layout import Rect, WindowLayout
 from scenes.tissue import NeoHookeanTissue, ShapeMatchingTissue
@@ -75,27 +75,29 @@ def geometry(**parts) -> Geometry:
 
 
 KEYS = default_keys()
-ALL_BOXES = {"view.show_scanner": True, "resection.show_resection": True}
+ENGINEER = {"view.show_engineer": True}
+ALL_BOXES = ENGINEER | {"view.show_scanner": True, "resection.show_resection": True}
 WHOLE = geometry(tumour=(1, 1), parts={"vessel": (1, 1)}, support=(1, 1))
 
 
 @pytest.mark.parametrize("doppler", ["off", "colour"])
 @pytest.mark.parametrize("size", [(700, 420), (1024, 600), *SCREENS])
 def test_no_part_of_the_window_overlaps_another(size, doppler):
-    layout = WindowLayout(*size)
+    layout = WindowLayout(*size, with_tools=True)
     settings = settings_with(ALL_BOXES | {"scanner.doppler": doppler})
     placed = boxes_of(settings, WHOLE, layout)
-    shown = [box for name, box in placed.items() if name in SCANNER_GROUPS]
+    shown = [box for box in placed.values() if box.top < layout.strip.top]
     assert len(shown) == (1 if size == (700, 420) else 3) and "Resection" in placed
     assert ("Doppler" in placed) == (doppler != "off" and len(shown) == 3)
     over = [layout.findings(layout.most_findings), layout.compass, *shown]
-    below = [box for name, box in placed.items() if name not in SCANNER_GROUPS]
-    parts = [*over, *below, layout.readouts, *image_boxes(layout)]
+    below = [box for box in placed.values() if box.top >= layout.strip.top]
+    parts = [*over, *below, layout.readouts, layout.messages, *image_boxes(layout)]
     for one, other in combinations(parts, 2):
         assert apart(one, other) or 0 in (*one[2:], *other[2:])
     for within, area in (
         (over, layout.scene),
-        ([*below, layout.readouts], layout.strip),
+        ([*below, layout.readouts], layout.tools),
+        ([layout.messages], layout.strip),
         (image_boxes(layout), layout.panel),
     ):
         for box in within:
@@ -113,8 +115,8 @@ def test_b_mode_and_ct_of_a_drop_in_probe_fill_the_panel(name):
 
 @each_size
 def test_the_first_sliders_are_left_out_where_there_is_no_room(size):
-    layout = WindowLayout(*size)
-    names = list(boxes_of(settings_with(), WHOLE, layout))
+    layout = WindowLayout(*size, with_tools=True)
+    names = list(boxes_of(settings_with(ENGINEER), WHOLE, layout))
     assert (layout.readouts.width == 0) == (size in ((700, 420), (1024, 600)))
     assert names == (["Image", "View"] if size == (700, 420) else ["Tissue", "Image", "View"])
 
@@ -127,7 +129,7 @@ def test_the_first_sliders_are_left_out_where_there_is_no_room(size):
 )
 def test_labels_of_controls_are_whole(width, tissue, doppler):
     settings = settings_with(ALL_BOXES | {"scanner.doppler": doppler}).model_copy(update={"tissue": tissue})
-    layout = WindowLayout(width, width * 9 // 16)
+    layout = WindowLayout(width, width * 9 // 16, with_tools=True)
     groups = groups_of(settings, WHOLE)
     for name, box in boxes_of(settings, WHOLE, layout).items():
         # Rows that do not fit have a scroll bar, 14 pixels wide.
@@ -287,7 +289,7 @@ def test_a_figure_without_a_value_is_a_dash():
 
 @pytest.mark.parametrize("size", [(1250, 703), (1280, 720), (1920, 1080), (3840, 2160)])
 def test_all_readouts_of_a_window_are_shown(size):
-    layout = WindowLayout(*size)
+    layout = WindowLayout(*size, with_tools=True)
     ends = [readout_image(layout, dict(list(FIGURES.items())[:count])) for count in (6, 7)]
     rows = np.flatnonzero((ends[0] != ends[1]).any(axis=(1, 2)))
     # In a large window the lines move closer together for the seventh.
@@ -366,7 +368,7 @@ def test_the_help_covers_all_and_leaves_nothing_behind():
     assert page.plane_point_at(box.left + 5, box.top + 5) == pytest.approx(
         to_plane(view(), box, box.left + 5, box.top + 5)
     )
-    page.show_help()
+    page.show_page("help", view())
     helped = page.pixels.transpose(1, 0, 2)[::-1, :, :3]
     assert np.ptp(helped[-1], axis=0).max() == 0 and page.plane_point_at(box.left + 5, box.top + 5) is None
     assert np.array_equal(composed(page, findings=FIGURES), before)

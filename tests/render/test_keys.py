@@ -14,6 +14,7 @@ from rehearsal.live_settings import LiveSettings
 from render.keys import (
     HELD,
     KEYS,
+    PAGES,
     STEPS,
     VIEW_ACTIONS,
     KeysError,
@@ -40,8 +41,8 @@ def refused(tmp_path, text: str) -> str:
 
 
 def test_every_action_does_one_thing():
-    # The mouse presses, and the window says whether it is frozen.
-    no_keys = "press", "frozen"
+    # The mouse presses and dismisses, and the window says whether it is frozen.
+    no_keys = "press", "frozen", "dismiss"
     flags = {
         each.name
         for each in dataclasses.fields(Controls)
@@ -49,7 +50,7 @@ def test_every_action_does_one_thing():
     }
     settings = [setting.name for setting in settings_in(LiveSettings) if setting.key is not None]
     mouse = USUAL.of.keys() - USUAL.keyed.keys()
-    does = [*mouse - flags, *HELD, *STEPS, *VIEW_ACTIONS, "help", *flags, *settings]
+    does = [*mouse - flags, *HELD, *STEPS, *VIEW_ACTIONS, *PAGES, *flags, *settings]
     assert sorted(does) == sorted(USUAL.of)
 
 
