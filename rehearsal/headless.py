@@ -115,7 +115,10 @@ class HeadlessLoop:
                 observer.observe(frame, probe)
             if pictures is not None and view is not None:
                 send_live(self.link, anatomy, view, probe)
-                pictures.draw(step, view, self.settings.view, self.measurements)
+                # What was cut is judged.
+                phase = "Inspect" if anatomy.cut is not None else self.settings.view.phase
+                shown = self.settings.view.model_copy(update=dict(phase=phase))
+                pictures.draw(step, view, shown, self.measurements)
             self.notices.present()
         return [pictures.save()] if pictures is not None else []
 

@@ -23,6 +23,7 @@ from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.window_panel import WindowPanel
 from render.viewer import Controls, View
 from render.window import Window
+from settings import with_values
 from ultrasound.persistence import Persistence
 from ultrasound.probe import Probe
 from ultrasound.scanner import IMAGES_OF_MODE
@@ -122,6 +123,9 @@ class WindowLoop:
             self._version = frame.geometry.version
             self.window.change_geometry(drawn_geometry(self.anatomy))
             self.panel.forget_images()
+            # What was cut is judged next; a cut that was taken back is made again.
+            phase = "Excise" if self.anatomy.cut is None else "Inspect"
+            self.window.settings = with_values(self.window.settings, {"view.phase": phase})
         return frame
 
     def _image(self, settings: LiveSettings) -> View:

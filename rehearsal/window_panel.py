@@ -21,6 +21,7 @@ from rehearsal.loop.protocols import Source
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.message_log import MessageLog
 from rehearsal.notices import Notices
+from rehearsal.phase_hints import hint
 from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.resection.resection_view import ResectionView, cut_settings
@@ -130,8 +131,10 @@ class WindowPanel:
             warnings=self._warnings(),
             clock=f"{time_s:.1f} s",
             pace=self._pace(times),
-            status=self._status(view, settings),
+            status=self._status(view),
             messages=self.messages.shown(perf_counter()),
+            hint=self._hint(settings),
+            findings=self._findings(view, settings),
             log=tuple((f"{at_s:.0f} s", text) for at_s, text in self.messages.kept),
             notes={name: self._with_hint(note) for name, note in view.notes.items()},
         )
@@ -163,6 +166,16 @@ class WindowPanel:
             self.cine.keep(shown)
         return shown
 
+    def _hint(self, settings: LiveSettings) -> str:
+        phase, coming = settings.view.phase, cut_settings(settings)
+        return self.keys.worded(hint(phase, self.anatomy, self.measurements, self.resection, coming))
+
+    def _findings(self, view: View, settings: LiveSettings) -> dict[str, str]:
+        """The figures that matter in the present phase."""
+        if settings.view.phase in ("Score", "Excise") and self.anatomy.cut is None:
+            return self.resection.figures(cut_settings(settings))
+        return view.findings
+
     def _indentation_mm(self) -> float:
         return self.measurements.manipulator.indentation_mm(self.anatomy.pose)
 
@@ -185,10 +198,9 @@ class WindowPanel:
             return note
         return self.keys.worded(f"{note}\n{HOW_TO_PRESS}")
 
-    def _status(self, view: View, settings: LiveSettings) -> str:
+    def _status(self, view: View) -> str:
         """The text over the images, the most important first: text that does not fit is cut at the end."""
-        score = self.resection.status(cut_settings(settings))
-        parts = [view.status, self.sweeping.status, self._state(), self.plans.status, score]
+        parts = [view.status, self.sweeping.status, self._state(), self.plans.status]
         return self.keys.worded("   ".join(filter(None, parts)))
 
     def _state(self) -> str:

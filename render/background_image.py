@@ -5,7 +5,7 @@ Each frame redraws only what changed.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import islice
 
 import numpy as np
@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw
 
 from render.keys import Keys, default_keys
 from render.message_box import log_image, message_image
+from render.phases import GAP_PX, TAB_PX, TOOL_PX, Tool, tabs_of
 from render.text import fitting_size, font, shortened
 from render.ultrasound_panel import (
     ALERT,
@@ -33,7 +34,7 @@ from render.ultrasound_panel import (
     status_image,
     to_plane,
 )
-from render.viewer import View
+from render.viewer import Phase, View
 from render.warning_box import warning_image, warning_rect
 from render.window_layout import CLOCK_WIDTH, FIGURE_HEIGHT, Rect, WindowLayout
 
@@ -78,7 +79,8 @@ class BackgroundImage:
         self._page: tuple = ()
         self._axes: np.ndarray | None = None
         self._status: str | None = None
-        self._messages: tuple[str, ...] | None = None
+        self._messages: tuple[object, ...] | None = None
+        self._tools: tuple[Phase, list[Tool]] = ("Scan", [])
         self._figures: Figures | None = None
         self._figures_at = 0.0
 
@@ -109,7 +111,7 @@ class BackgroundImage:
             taken,
         )
         if self._page or self._backdrop != parts:
-            self._rows[:, :, :3] = backdrop(self.layout, view, self.keys.of["help"])
+            self._rows[:, :, :3] = backdrop(self.layout, view, self.keys.of["help"], *self._tools)
             self._figures, self._axes, self._status, self._messages, self._page = None, None, None, None, ()
             self._empty_scene, self.has_scene = self._scene.copy(), False
         self._view, self._backdrop, self._taken = view, parts, taken
@@ -119,9 +121,10 @@ class BackgroundImage:
         if view.status != self._status:
             self._put(self.layout.status, status_image(self.layout, view.status))
             self._status = view.status
-        if view.messages != self._messages:
-            self._put(self.layout.messages, message_image(self.layout, view.messages))
-            self._messages = view.messages
+        messages = view.messages, view.hint
+        if messages != self._messages:
+            self._put(self.layout.messages, message_image(self.layout, *messages))
+            self._messages = messages
         figures = dict(view.readouts), findings, view.alert, view.clock, view.pace
         self._compose_figures(figures, slow_figures)
         if self._axes is None or not np.array_equal(axes, self._axes):
@@ -129,6 +132,11 @@ class BackgroundImage:
             self._axes = axes
         if (warned := self._warning_rect(view)) is not None:
             self._put(warned, warning_image(self.layout, view.warnings, self._taken))
+
+    def put_tools(self, phase: Phase, tools: list[Tool]) -> None:
+        """Have the tools of a phase in the images that follow."""
+        if (phase, tools) != self._tools:
+            self._tools, self._backdrop = (phase, tools), ()
 
     def draw_scene(self, draw: Callable[[np.ndarray], None]) -> None:
         """Draw the 3D view into ``pixels``, behind what ``compose`` has drawn; ``draw`` does it."""
@@ -208,7 +216,9 @@ class BackgroundImage:
         return next((to_plane(self._view, box, column, row) for box in hit), None)
 
 
-def backdrop(layout: WindowLayout, view: View, help_key: str = "H") -> np.ndarray:
+def backdrop(
+    layout: WindowLayout, view: View, help_key: str = "H", phase: Phase = "Scan", tools: Sequence[Tool] = ()
+) -> np.ndarray:
     """What stays the same from frame to frame, uint8, shape (height, width, 3)."""
     fade = np.linspace(0, 1, layout.scene.height)[:, None]
     rows = (1 - fade) * np.array(BACKDROP_TOP) + fade * np.array(BACKDROP_FOOT)
@@ -218,16 +228,40 @@ def backdrop(layout: WindowLayout, view: View, help_key: str = "H") -> np.ndarra
     image = Image.fromarray(page)
     draw = ImageDraw.Draw(image)
     px, middle, clock = layout.px, layout.title.height // 2, clock_box(layout, help_key)
+    left = max(box.right for box in tabs_of(layout).values()) + px(16)
     hint, title = (
         HELP_HINT.format(help_key),
-        shortened(view.title or "Nephron", px(17), clock.left - 2 * px(16)),
+        shortened(view.title or "Nephron", px(15), clock.left - left - px(16)),
     )
     draw.text((layout.title.right - px(16), middle), hint, font=font(px(14)), fill=TEXT, anchor="rm")
-    draw.text((px(16), middle), title, font=font(px(17)), fill=TEXT, anchor="lm")
+    draw.text((left, middle), title, font=font(px(15)), fill=QUIET, anchor="lm")
     draw_panel(draw, layout, view)
     for y in (layout.title.bottom - 1, layout.strip.top):
         draw.line([(0, y), (layout.strip.right, y)], fill=LINE)
+    _draw_tabs(draw, layout, phase)
+    for tool in tools:
+        _draw_tool(draw, layout, tool)
     return np.array(image)
+
+
+def _draw_tabs(draw: ImageDraw.ImageDraw, layout: WindowLayout, phase: Phase) -> None:
+    """Draw the phases; the present one is underlined."""
+    for name, box in tabs_of(layout).items():
+        is_on, place = name == phase, (box.left + box.width / 2, box.height / 2)
+        colour, letters = TEXT if is_on else QUIET, font(layout.px(TAB_PX))
+        draw.text(place, name, font=letters, fill=colour, anchor="mm")
+        if is_on:
+            y, around = box.bottom - layout.px(2), layout.px(8)
+            draw.line([(box.left + around, y), (box.right - around, y)], fill=MARK, width=layout.px(3))
+
+
+def _draw_tool(draw: ImageDraw.ImageDraw, layout: WindowLayout, tool: Tool) -> None:
+    """Draw a button: what it does, and its key."""
+    box, px, letters = tool.box, layout.px, font(layout.px(TOOL_PX))
+    edges, middle = [box.left, box.top, box.right - 1, box.bottom - 1], box.top + box.height / 2
+    draw.rounded_rectangle(edges, px(4), fill=HELP, outline=MARK if tool.is_on else LINE)
+    draw.text((box.left + px(GAP_PX), middle), tool.label, font=letters, fill=TEXT, anchor="lm")
+    draw.text((box.right - px(GAP_PX), middle), tool.key, font=letters, fill=MARK, anchor="rm")
 
 
 def clock_box(layout: WindowLayout, help_key: str = "H") -> Rect:

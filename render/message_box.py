@@ -28,15 +28,15 @@ def message_lines(layout: WindowLayout, messages: tuple[str, ...]) -> tuple[list
     return [*lines[: MESSAGE_LINES - 1], lines[MESSAGE_LINES - 1] + " ..."], layout.px(LEAST_PX)
 
 
-def message_image(layout: WindowLayout, messages: tuple[str, ...]) -> np.ndarray:
-    """The box of messages, uint8, shape of layout.messages."""
+def message_image(layout: WindowLayout, messages: tuple[str, ...], hint: str = "") -> np.ndarray:
+    """The box of messages, or where there are none of a hint, uint8, shape of layout.messages."""
     box = layout.messages
     image = Image.new("RGB", (box.width, box.height), STRIP)
-    draw = ImageDraw.Draw(image)
-    lines, size = message_lines(layout, messages)
+    draw, colour = ImageDraw.Draw(image), ALERT if messages else TEXT
+    lines, size = message_lines(layout, messages or (hint,))
     for place, line in enumerate(lines):
         middle = layout.px(MESSAGE_PITCH) * (place + 0.5) + layout.figures_pad / 2
-        draw.text((layout.px(BESIDE_PX), middle), line, font=font(size), fill=ALERT, anchor="lm")
+        draw.text((layout.px(BESIDE_PX), middle), line, font=font(size), fill=colour, anchor="lm")
     return np.asarray(image)
 
 

@@ -4,7 +4,7 @@ Lengths are in mm, angles in degrees, patient coordinates LPS. Nothing here need
 """
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Generic, Literal, TypeVar
+from typing import Annotated, Any, Generic, Literal, TypeVar, get_args
 
 import numpy as np
 from pydantic import Field
@@ -13,6 +13,8 @@ from settings import Control, Key, Section
 from ultrasound.probe import Probe, ScannerSettings
 
 Technique = Literal["enucleation", "enucleoresection", "wedge"]
+Phase = Literal["Scan", "Score", "Excise", "Inspect"]
+PHASES: tuple[Phase, ...] = get_args(Phase)
 
 # Groups of controls beside the image, as on a scanner: TGC or Doppler, and those of a resection, where the
 # user asks for them.
@@ -22,6 +24,7 @@ B_MODE, TGC, DOPPLER, RESECTION = "B-mode", "TGC", "Doppler", "Resection"
 class ViewSettings(Section):
     """What the window shows."""
 
+    phase: Annotated[Phase, Key("Shift+Return", "View", "next phase: scan, score, excise, inspect")] = "Scan"
     translucent: Annotated[
         bool, Control("Translucent", "View"), Key("T", "View", "organ translucent or solid")
     ] = True
@@ -203,6 +206,8 @@ class View:
     """Its rate, where slower than real time: "0.2 x real"."""
     messages: tuple[str, ...] = ()
     """Messages to the user, the oldest first."""
+    hint: str = ""
+    """What to do next, where there is no message."""
     log: tuple[tuple[str, str], ...] = ()
     """All messages of the session, each with its time before it: ("42.6 s", "Bookmark 1")."""
     warnings: tuple[str, ...] = ()

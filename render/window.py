@@ -25,13 +25,15 @@ from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
 from render.display import display_available
 from render.gamepad import Gamepad
 from render.graphics_scene import GraphicsScene
-from render.keys import PAGES, Keys, begin, default_keys, hold
+from render.keys import HELD, PAGES, Keys, begin, default_keys, hold
+from render.phases import tabs_of, tools_of
 from render.scene_view import SceneView
 from render.sliders import boxes_of, draw_sliders
 from render.software_scene import SoftwareScene
 from render.viewer import Controls, Geometry, UserSettings, View
 from render.vulkan_device import draws_by_processor
 from render.window_layout import FULL_SIZE, Rect, WindowLayout
+from settings import with_values
 from sim.device import on_cpu
 from sim.taichi_internals import set_image
 
@@ -99,6 +101,9 @@ class Window(Generic[UserSettings]):
         self._drag: str | None = None
         self._cursor: np.ndarray | None = None
         self._pressing = self._held_shift = False
+        # The boxes of the tools by action, and the tool that the mouse holds.
+        self._tools: dict[str, Rect] = {}
+        self._held_tool = ""
         # The boxes of sliders by group, and how often the user moved each.
         self._slider_boxes: dict[str, Rect] = {}
         self._boxes_moved: Counter[str] = Counter()
@@ -169,7 +174,8 @@ class Window(Generic[UserSettings]):
             return
         self._read_cursor()
         self._read_events(controls)
-        for action in (action for action, key in self.keys.held() if self._window.is_pressed(key)):
+        pressed = [action for action, key in self.keys.held() if self._window.is_pressed(key)]
+        for action in {*pressed, self._held_tool} - {""}:
             hold(action, controls, elapsed)
             if action in ZOOM_SENSE:
                 self.camera.zoom(np.exp(ZOOM_SENSE[action] * elapsed / ZOOM_S))
@@ -224,7 +230,7 @@ class Window(Generic[UserSettings]):
             if self._window.is_pressed(event.key):
                 continue
             if event.key == ti.ui.LMB:
-                self._pressing = False
+                self._pressing, self._held_tool = False, ""
                 self._restore_sliders()
             elif event.key in (ti.ui.RMB, ti.ui.MMB):
                 self._drag = None
@@ -237,6 +243,7 @@ class Window(Generic[UserSettings]):
             if self._cursor is not None and not self._page:
                 place = self._pixel(self._cursor)
                 controls.dismiss = self.layout.messages.contains(*place)
+                self._click(place, controls)
                 controls.pointed_mm = self._background.plane_point_at(*place)
                 boxes = self._slider_boxes.items()
                 pressed = [name for name, box in boxes if box.widened(BOX_EDGE_PX).contains(*place)]
@@ -244,10 +251,25 @@ class Window(Generic[UserSettings]):
         elif key in (ti.ui.RMB, ti.ui.MMB) and self._over_scene():
             pans = key == ti.ui.MMB or with_shift
             self._drag = "pan" if pans else "orbit"
-        elif (action := self.keys.action_of(key, with_shift)) in PAGES:
+        else:
+            self._begin(self.keys.action_of(key, with_shift), controls)
+
+    def _begin(self, action: str, controls: Controls) -> None:
+        """Apply an action whose key went down, or whose tool was clicked on."""
+        if action in PAGES:
             self._page = "" if self._page == action else action
         else:
             begin(action, controls)
+
+    def _click(self, place: tuple[float, float], controls: Controls) -> None:
+        """Choose a phase, or use a tool, that is at a column and row."""
+        for phase, box in tabs_of(self.layout).items():
+            if box.contains(*place):
+                controls.settings = with_values(controls.settings, {"view.phase": phase})
+        for action, box in self._tools.items():
+            if box.contains(*place):
+                self._held_tool = action if action in HELD else ""
+                self._begin(action, controls)
 
     def _restore_sliders(self) -> None:
         """After a drag that may have moved a box of sliders, have a new one: GGUI cannot move a box."""
@@ -332,9 +354,12 @@ class Window(Generic[UserSettings]):
         if self._page:
             self._background.show_page(self._page, view)
         else:
-            if self.layout.with_tools != self.settings.view.show_engineer:
-                self._change_layout(replace(self.layout, with_tools=self.settings.view.show_engineer))
+            if self.layout.has_engineer != self.settings.view.show_engineer:
+                self._change_layout(replace(self.layout, has_engineer=self.settings.view.show_engineer))
             self._place_sliders()
+            tools = tools_of(self.layout, self.settings, self.keys)
+            self._tools = {tool.action: tool.box for tool in tools}
+            self._background.put_tools(self.settings.view.phase, tools)
             self._background.compose(view, np.stack(self.camera.axes()), self._taken(), self._visible)
             keeps = self._is_ahead or self._keeps_scene()
             if self._software is not None and not (keeps and self._background.has_scene):

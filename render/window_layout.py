@@ -9,8 +9,9 @@ import numpy as np
 # read-outs below it.
 PANEL_SHARE = 0.43
 TITLE_HEIGHT, CLOCK_WIDTH = 42, 150
-TOOLS_HEIGHT, STRIP_GAP, READOUT_WIDTH = 184, 4, 134
+ENGINEER_HEIGHT, STRIP_GAP, READOUT_WIDTH = 184, 4, 134
 MESSAGE_LINES, MESSAGE_PITCH = 3, 20
+TOOL_ROWS, TOOL_HEIGHT, TOOL_GAP = 2, 28, 6
 HEADER_HEIGHT, FOOTER_HEIGHT = 74, 52
 STATUS_MIDDLE, STATUS_HEIGHT = 43, 18
 RULER_WIDTH, WEDGE_WIDTH, IMAGE_GAP, NAME_HEIGHT = 42, 30, 10, 26
@@ -25,6 +26,8 @@ STRIP_WITH_READOUTS = 712
 FULL_SIZE, LEAST_SCALE, MOST_SCALE = (1280, 720), 0.8, 4.0
 # How much larger images must be one under the other to be preferred to side by side.
 BELOW_FROM = 1.2
+# Where images side by side would leave height empty, the others are smaller than the first, by this share.
+OTHERS_SHARE = 0.6
 
 
 class Rect(NamedTuple):
@@ -59,13 +62,13 @@ class Rect(NamedTuple):
 
 @dataclass(frozen=True)
 class WindowLayout:
-    """The boxes of all parts of a window of width x height pixels, ``with_tools`` also of those for an
-    engineer.
+    """The boxes of all parts of a window of width x height pixels, also of those for an engineer where
+    ``has_engineer``.
     """
 
     width: int
     height: int
-    with_tools: bool = False
+    has_engineer: bool = False
 
     @property
     def scale(self) -> float:
@@ -101,7 +104,7 @@ class WindowLayout:
 
     @property
     def strip(self) -> Rect:
-        """Messages, and an engineer's sliders and read-outs, beneath the 3D view."""
+        """Messages, tools, and an engineer's sliders and read-outs, beneath the 3D view."""
         top = self.messages.top - 1
         return Rect(0, top, self.panel.left, self.height - top)
 
@@ -113,8 +116,21 @@ class WindowLayout:
 
     @property
     def tools(self) -> Rect:
-        """An engineer's sliders and read-outs, in the lower part of the strip."""
-        height = min(max(TOOLS_HEIGHT, self.px(TOOLS_HEIGHT)), self.height // 3) if self.with_tools else 0
+        """The rows of a phase's tools."""
+        height = TOOL_ROWS * self.px(TOOL_HEIGHT + TOOL_GAP) + self.px(TOOL_GAP)
+        return Rect(0, self.engineer.top - height, self.panel.left, height)
+
+    def tool_row(self, number: int) -> Rect:
+        """A row of tools."""
+        gap, height = self.px(TOOL_GAP), self.px(TOOL_HEIGHT)
+        top = self.tools.top + number * self.px(TOOL_HEIGHT + TOOL_GAP)
+        return Rect(gap, top, self.tools.width - 2 * gap, height)
+
+    @property
+    def engineer(self) -> Rect:
+        """An engineer's sliders and read-outs, in the lowest part of the strip."""
+        height = min(max(ENGINEER_HEIGHT, self.px(ENGINEER_HEIGHT)), self.height // 3)
+        height *= self.has_engineer
         return Rect(0, self.height - height, self.panel.left, height)
 
     @property
@@ -135,9 +151,9 @@ class WindowLayout:
 
     @property
     def readouts(self) -> Rect:
-        is_wide = self.with_tools and self.strip.width >= STRIP_WITH_READOUTS
+        is_wide = self.has_engineer and self.strip.width >= STRIP_WITH_READOUTS
         width = self.px(READOUT_WIDTH) if is_wide else 0
-        return Rect(self.tools.right - width, self.tools.top, width, self.tools.height)
+        return Rect(self.engineer.right - width, self.engineer.top, width, self.engineer.height)
 
     @property
     def compass(self) -> Rect:
@@ -176,9 +192,9 @@ class WindowLayout:
         return [
             Rect(
                 round(gap * (i + 1) + edges[i]),
-                self.tools.top + gap,
+                self.engineer.top + gap,
                 round(edges[i + 1] - edges[i]),
-                min(TOOLS_HEIGHT - 2 * STRIP_GAP, self.tools.height - 2 * gap),
+                min(ENGINEER_HEIGHT - 2 * STRIP_GAP, self.engineer.height - 2 * gap),
             )
             for i in range(len(widths))
         ]
@@ -207,8 +223,8 @@ class WindowLayout:
         return Rect(0, 0, self.width, self.height)
 
     def image_boxes(self, count: int, width_mm: float, depth_mm: float) -> list[Rect]:
-        """The largest boxes in the panel with the shape of the image plane, side by side or one under the
-        other.
+        """The largest boxes in the panel with the shape of the image plane: side by side, the first larger
+        where that leaves less empty, or one under the other.
 
         Raises ValueError unless both lengths are positive.
         """
@@ -221,15 +237,18 @@ class WindowLayout:
         beside = min((room_x - (count - 1) * gap) / count / width_mm, room_y / depth_mm)
         below = min(room_x / width_mm, (room_y - (count - 1) * between) / count / depth_mm)
         # Side by side is preferred: equal depths are then at equal heights.
-        rows = count if below > BELOW_FROM * beside else 1
-        columns, scale = count // rows, below if rows > 1 else beside
-        width, height = max(1, round(width_mm * scale)), max(1, round(depth_mm * scale))
-        left = self.panel.left + ruler + (room_x - columns * width - (columns - 1) * gap) // 2
-        return [
-            Rect(left + i * (width + gap), header + j * (height + between), width, height)
-            for j in range(rows)
-            for i in range(columns)
-        ]
+        if below > BELOW_FROM * beside:
+            width, height = max(1, round(width_mm * below)), max(1, round(depth_mm * below))
+            left = self.panel.left + ruler + (room_x - width) // 2
+            return [Rect(left, header + j * (height + between), width, height) for j in range(count)]
+        shares = np.r_[1.0, np.full(count - 1, OTHERS_SHARE)]
+        first = min((room_x - (count - 1) * gap) / shares.sum() / width_mm, room_y / depth_mm)
+        # As low as the panel they have one size.
+        scales = first * shares if beside * depth_mm < room_y else np.full(count, beside)
+        widths, heights = (np.maximum(1, np.rint(mm * scales)).astype(int) for mm in (width_mm, depth_mm))
+        lefts = np.r_[0, np.cumsum(widths[:-1] + gap)]
+        lefts += self.panel.left + ruler + (room_x - lefts[-1] - widths[-1]) // 2
+        return [Rect(*map(int, box)) for box in zip(lefts, [header] * count, widths, heights, strict=True)]
 
     def window_coordinates(self, rect: Rect) -> tuple[float, float, float, float]:
         """Left, bottom, right, top with (0, 0) at the bottom left and (1, 1) at the top right of the

@@ -203,12 +203,13 @@ class LiveMeasurements:
 
     def onto(self, view: View, shown: ViewSettings) -> View:
         """A view with the measurements."""
-        status = view.status
+        status, judgement = view.status, self.anatomy.judgement
+        is_judged = judgement is not None and shown.phase != "Scan"
         if self.is_over_limit and self.latest is not None and not status:
             status = f"TISSUE COMPRESSED BY {self.latest.compression_mm:.0f} mm"
         return replace(
             view,
-            findings=self._findings,
+            findings=findings_of(judgement) if judgement is not None and is_judged else self._findings,
             alert=COMPRESSION if self.is_over_limit else "",
             seen=self._shown_coverage() if shown.show_seen else {},
             guidance=self.guide.guidance() if self.guide is not None else None,
@@ -223,8 +224,6 @@ class LiveMeasurements:
 
     def findings(self) -> dict[str, str]:
         """Name -> figure with its unit."""
-        if self.anatomy.judgement is not None:
-            return findings_of(self.anatomy.judgement)
         findings, plan = self._tissue_findings(), self.guide.figures() if self.guide is not None else {}
         if plan:
             off_mm, off_deg = plan["plan_off_mm"], plan["plan_off_deg"]

@@ -113,6 +113,25 @@ class ResectionView:
         except ResectionError as error:
             self.fault = str(error)
 
+    @property
+    def mark_count(self) -> int:
+        """The number of marks of the score."""
+        return len(self._marks)
+
+    def figures(self, settings: CutSettings) -> dict[str, str]:
+        """Name -> figure with its unit, of the score and of the coming cut."""
+        figures = {"marks": str(self.mark_count), "technique": settings.technique}
+        if self.line is not None:
+            figures["line"] = f"{self.line.length_mm:.0f} mm"
+        if len(self.tumour_mm):
+            figures["line to tumour"] = f"{self.tumour_mm.min():.1f} mm"
+        depth = "as seen" if settings.depth_mm is None else f"{settings.depth_mm:.0f} mm"
+        return figures | {
+            "margin asked": f"{settings.margin_mm:.0f} mm",
+            "depth": depth,
+            "tumour surface seen": f"{100 * self.seen_share:.0f} %",
+        }
+
     def section(self) -> np.ndarray | None:
         """The coming resection surface on the image plane: segments (n, 2, 2) [mm]; None without one."""
         planned, interpolation = self._planned, self.anatomy.geometry.whole
@@ -137,25 +156,6 @@ class ResectionView:
         line, marks = points[:on_line], points[on_line:]
         near = self.tumour_mm < margin_mm - TOLERANCE_MM if len(self.tumour_mm) else np.zeros(len(line), bool)
         return Score(line, marks, near, planned)
-
-    def status(self, settings: CutSettings) -> str:
-        """The text over the images while scoring; empty before the first mark and after the cut."""
-        count = len(self._marks)
-        if count == 0 or self.anatomy.cut is not None:
-            return ""
-        line = self.line
-        # Warnings first: of what is too long for the panel, the last is not shown.
-        parts = []
-        if self.fault:
-            # The reason; what to do about it is said where a cut is refused.
-            parts.append(self.fault.partition(";")[0])
-        if settings.depth_mm is None and self.seen_share < LEAST_SEEN:
-            parts.append(f"tumour surface seen {100 * self.seen_share:.0f} %")
-        if len(self.tumour_mm) and self.tumour_mm.min() < settings.margin_mm - TOLERANCE_MM:
-            parts.append(f"red: {self.tumour_mm.min():.1f} of {settings.margin_mm:.0f} mm margin")
-        parts.append(f"SCORE {count} marks" + ("" if line is None else f" {line.length_mm:.0f} mm"))
-        parts.append(settings.technique)
-        return "   ".join(parts)
 
 
 def _now(skin: Skin) -> np.ndarray:

@@ -83,7 +83,7 @@ WHOLE = geometry(tumour=(1, 1), parts={"vessel": (1, 1)}, support=(1, 1))
 @pytest.mark.parametrize("doppler", ["off", "colour"])
 @pytest.mark.parametrize("size", [(700, 420), (1024, 600), *SCREENS])
 def test_no_part_of_the_window_overlaps_another(size, doppler):
-    layout = WindowLayout(*size, with_tools=True)
+    layout = WindowLayout(*size, has_engineer=True)
     settings = settings_with(ALL_BOXES | {"scanner.doppler": doppler})
     placed = boxes_of(settings, WHOLE, layout)
     shown = [box for box in placed.values() if box.top < layout.strip.top]
@@ -96,7 +96,7 @@ def test_no_part_of_the_window_overlaps_another(size, doppler):
         assert apart(one, other) or 0 in (*one[2:], *other[2:])
     for within, area in (
         (over, layout.scene),
-        ([*below, layout.readouts], layout.tools),
+        ([*below, layout.readouts], layout.engineer),
         ([layout.messages], layout.strip),
         (image_boxes(layout), layout.panel),
     ):
@@ -115,7 +115,7 @@ def test_b_mode_and_ct_of_a_drop_in_probe_fill_the_panel(name):
 
 @each_size
 def test_the_first_sliders_are_left_out_where_there_is_no_room(size):
-    layout = WindowLayout(*size, with_tools=True)
+    layout = WindowLayout(*size, has_engineer=True)
     names = list(boxes_of(settings_with(ENGINEER), WHOLE, layout))
     assert (layout.readouts.width == 0) == (size in ((700, 420), (1024, 600)))
     assert names == (["Image", "View"] if size == (700, 420) else ["Tissue", "Image", "View"])
@@ -129,7 +129,7 @@ def test_the_first_sliders_are_left_out_where_there_is_no_room(size):
 )
 def test_labels_of_controls_are_whole(width, tissue, doppler):
     settings = settings_with(ALL_BOXES | {"scanner.doppler": doppler}).model_copy(update={"tissue": tissue})
-    layout = WindowLayout(width, width * 9 // 16, with_tools=True)
+    layout = WindowLayout(width, width * 9 // 16, has_engineer=True)
     groups = groups_of(settings, WHOLE)
     for name, box in boxes_of(settings, WHOLE, layout).items():
         # Rows that do not fit have a scroll bar, 14 pixels wide.
@@ -289,7 +289,7 @@ def test_a_figure_without_a_value_is_a_dash():
 
 @pytest.mark.parametrize("size", [(1250, 703), (1280, 720), (1920, 1080), (3840, 2160)])
 def test_all_readouts_of_a_window_are_shown(size):
-    layout = WindowLayout(*size, with_tools=True)
+    layout = WindowLayout(*size, has_engineer=True)
     ends = [readout_image(layout, dict(list(FIGURES.items())[:count])) for count in (6, 7)]
     rows = np.flatnonzero((ends[0] != ends[1]).any(axis=(1, 2)))
     # In a large window the lines move closer together for the seventh.
