@@ -55,8 +55,10 @@ ARM, BEYOND = 0.27, 0.11
 LETTER_PX, LINE_PX = 14, 2
 # A shorter projected axis has no letters.
 LEAST_LENGTH = 0.3
-HELP_HINT = "{}  all keys"
+HELP_HINT = "{}  keys"
 PROGRAM_PX = 40
+# In less room the title is left out.
+LEAST_TITLE = 60
 HELP_COLUMNS, HELP_PX, HELP_GAP_PX, FIGURES_GAP_PX = 2, 17, 12, 18
 
 
@@ -229,12 +231,17 @@ def backdrop(
     draw = ImageDraw.Draw(image)
     px, middle, clock = layout.px, layout.title.height // 2, clock_box(layout, help_key)
     left = max(box.right for box in tabs_of(layout).values()) + px(16)
-    hint, title = (
+    draw.text(
+        (layout.title.right - px(16), middle),
         HELP_HINT.format(help_key),
-        shortened(view.title or "Nephron", px(15), clock.left - left - px(16)),
+        font=font(px(14)),
+        fill=TEXT,
+        anchor="rm",
     )
-    draw.text((layout.title.right - px(16), middle), hint, font=font(px(14)), fill=TEXT, anchor="rm")
-    draw.text((left, middle), title, font=font(px(15)), fill=QUIET, anchor="lm")
+    room = clock.left - left - px(16)
+    if room > px(LEAST_TITLE):
+        title = shortened(view.title or "Nephron", px(15), room)
+        draw.text((left, middle), title, font=font(px(15)), fill=QUIET, anchor="lm")
     draw_panel(draw, layout, view)
     for y in (layout.title.bottom - 1, layout.strip.top):
         draw.line([(0, y), (layout.strip.right, y)], fill=LINE)
@@ -265,10 +272,11 @@ def _draw_tool(draw: ImageDraw.ImageDraw, layout: WindowLayout, tool: Tool) -> N
 
 
 def clock_box(layout: WindowLayout, help_key: str = "H") -> Rect:
-    """The box of the clock, in the title's row, left of the help hint."""
+    """The box of the clock, in the title's row, between the phases and the help hint."""
     px = layout.px
     right = layout.title.right - 2 * px(16) - int(font(px(14)).getlength(HELP_HINT.format(help_key)))
-    return Rect(right - px(CLOCK_WIDTH), 0, px(CLOCK_WIDTH), layout.title.height - 1)
+    left = max(right - px(CLOCK_WIDTH), *(box.right for box in tabs_of(layout).values()))
+    return Rect(left, 0, right - left, layout.title.height - 1)
 
 
 def clock_image(layout: WindowLayout, box: Rect, clock: str, pace: str) -> np.ndarray:

@@ -9,7 +9,7 @@ from render.viewer import PHASES, Phase, WindowSettings
 from render.window_layout import Rect, WindowLayout
 from settings import live_settings, value_of
 
-TAB_PX, TOOL_PX, AROUND_PX, GAP_PX = 16, 14, 12, 6
+TAB_PX, TOOL_PX, AROUND_PX, GAP_PX = 15, 14, 9, 6
 # Of each phase the rows of tools: what is written, and the action.
 TOOLS: dict[Phase, tuple[dict[str, str], ...]] = {
     "Scan": (
@@ -81,13 +81,17 @@ def tabs_of(layout: WindowLayout) -> dict[Phase, Rect]:
 
 
 def tools_of(layout: WindowLayout, settings: WindowSettings, keys: Keys) -> list[Tool]:
-    """The buttons of the present phase; of a row that is too long the last are left out."""
+    """The buttons of the present phase, of actions that have a key; of a row that is too long the last are
+    left out.
+    """
     values = {setting.name: value_of(settings, setting) for setting in live_settings(settings)}
     rows = TOOLS[settings.view.phase]
     tools: list[Tool] = []
     for number, row in enumerate(rows):
         left, room = layout.px(GAP_PX), layout.tool_row(number)
         for label, action in row.items():
+            if action not in keys.of:
+                continue
             value = values.get(action)
             label = _with_value(label, value)
             width = _width(layout, label) + _width(layout, keys.of[action]) + layout.px(3 * GAP_PX)

@@ -57,8 +57,8 @@ def boxes_of(settings: WindowSettings, geometry: Geometry, layout: WindowLayout)
     boxes = dict(zip(widths, layout.sliders(list(widths.values())), strict=True))
     names = [RESECTION] if settings.resection.show_resection else []
     if settings.view.show_scanner:
-        names += [] if settings.view.show_engineer else ["Image"]
         names += [B_MODE, TGC if settings.scanner.doppler == "off" else DOPPLER]
+        names += [] if settings.view.show_engineer else ["Image"]
     return boxes | _beside_panel(settings, {name: groups[name] for name in names}, layout)
 
 

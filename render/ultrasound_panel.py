@@ -128,7 +128,7 @@ def draw_panel(draw: ImageDraw.ImageDraw, layout: WindowLayout, view: View) -> N
     _draw_row(draw, left, width, px(22), (probe, px(17), TEXT), (depth, px(15), TEXT))
     _draw_row(draw, left, width, area.bottom - px(17), (b_mode, px(14), QUIET), (ct, px(14), QUIET))
     if view.outline_mm is not None:
-        _draw_legend(draw, layout, boxes[0].left, boxes[-1].bottom)
+        _draw_legend(draw, layout, boxes[0].left, max(box.bottom for box in boxes))
     _draw_ruler(draw, layout, view, boxes[0])
     _draw_scale(draw, layout, view, boxes[-1])
     for name, box in zip(view.images, boxes, strict=True):

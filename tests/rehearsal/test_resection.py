@@ -25,6 +25,7 @@ from rehearsal.loop.frame import Frame
 from rehearsal.loop.timeline import Timeline
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.notices import Notices
+from rehearsal.phase_hints import hint
 from rehearsal.planning.plan_file import write_plan
 from rehearsal.pressed_organ import PressedOrgan
 from rehearsal.rehearsal import Rehearsal
@@ -57,7 +58,7 @@ from rehearsal.sessions.replay import Replay, ReplayCheck
 from rehearsal.sessions.session_file import Log, read_log
 from rehearsal.sources.user import UserSource
 from rehearsal.tracking.pose_file import PoseError, load_timed_poses
-from render.viewer import Controls
+from render.viewer import Controls, Phase
 from scenes.scene import with_options
 from scenes.surfaces import signed_distance_from
 from sim.fields import Field
@@ -375,7 +376,11 @@ def test_the_distance_of_a_line_to_the_tumour_is_negative_over_it():
 
 def test_the_view_warns_of_a_line_that_is_too_near_and_shows_the_coming_cut(rehearsal, marks):
     anatomy = rehearsal.anatomy
-    shown, seen = ResectionView(anatomy), LiveMeasurements(anatomy, rehearsal.manipulator).coverage
+    measurements = LiveMeasurements(anatomy, rehearsal.manipulator)
+    shown, seen = ResectionView(anatomy), measurements.coverage
+
+    def hint_of(phase: Phase, **settings) -> str:
+        return hint(phase, anatomy, measurements, shown, CutSettings(**settings))
 
     def look(time_s: float, is_seen: bool) -> None:
         """Update at a time, after images that have shown all or nothing."""
@@ -384,18 +389,26 @@ def test_the_view_warns_of_a_line_that_is_too_near_and_shows_the_coming_cut(rehe
         shown.update(CutSettings(), seen.is_seen)
 
     look(0.0, True)
-    assert shown.score(MARGIN_MM) is None and shown.status(CutSettings()) == ""
+    assert shown.score(MARGIN_MM) is None and shown.figures(CutSettings())["marks"] == "0"
+    assert "Mark the line" in hint_of("Score") and "Score comes first" in hint_of("Excise")
     scored(rehearsal, marks)
     look(0.0, True)
-    assert not shown.score(MARGIN_MM).is_near.any() and "margin" not in shown.status(CutSettings())
+    assert not shown.score(MARGIN_MM).is_near.any() and "Next: Excise" in hint_of("Score")
+    assert "{cut_out} cuts along the line: enucleoresection, 5 mm of margin, as deep as seen" in hint_of(
+        "Excise"
+    )
+    assert "Nothing was cut yet" in hint_of("Inspect")
     # Between marks a geodesic may be nearer than they are, by the sagitta of their arc.
     assert shown.tumour_mm.min() > MARGIN_MM - 0.5
     assert shown.score(MARGIN_MM + 2.0).is_near.all()
-    assert "red: " in shown.status(CutSettings(margin_mm=MARGIN_MM + 2.0))
+    assert "is red where it is nearer to the tumour than the 7 mm asked" in hint_of("Score", margin_mm=7.0)
+    assert float(shown.figures(CutSettings())["line to tumour"].split()[0]) == pytest.approx(
+        shown.tumour_mm.min(), abs=0.06
+    )
     look(1.0, False)
-    assert "no part of the tumour was seen" in shown.status(CutSettings())
-    assert "tumour surface seen 0 %" in shown.status(CutSettings())
-    assert "surface seen" not in shown.status(CutSettings(depth_mm=12.0))
+    assert "no part of the tumour was seen" in hint_of("Excise")
+    assert shown.figures(CutSettings())["tumour surface seen"] == "0 %"
+    assert "12 mm deep" in hint_of("Excise", depth_mm=12.0) or shown.fault
     assert shown.section() is None
     moved_to(rehearsal, touching_at(rehearsal, rehearsal.case.tumour.center_mass))
     look(2.0, True)

@@ -127,7 +127,7 @@ class Looping:
         self.anatomy, self.measurements, self.source = FakeAnatomy(), FakeMeasurements(), OneMove()
         self.anatomy.show(self.stepper.newest())
         announcements = Announcements(self.anatomy, self.notices)
-        resection = SimpleNamespace(update=lambda *_: None, score=lambda _: None, status=lambda _: "")
+        resection = SimpleNamespace(update=lambda *_: None, score=lambda _: None, figures=lambda _: {})
         self.plans = SimpleNamespace(status="", control=lambda controls: None)
         self.panel = WindowPanel(
             *(self.anatomy, self.source, self.measurements, resection, self.plans),
@@ -237,12 +237,13 @@ def test_a_geometry_of_another_version_is_drawn_anew_and_earlier_images_are_forg
     timeline = looping.stepper
     looping.next()
     whole, cine = timeline.geometry, looping.panel.cine
-    timeline.geometry = replace(whole, version=1)
+    timeline.geometry, looping.anatomy.cut = replace(whole, version=1), "a cut"
     looping.next()
     assert changed == [1] and looping.panel.cine is not cine
-    timeline.geometry = whole
+    assert looping.viewer.settings.view.phase == "Inspect"
+    timeline.geometry, looping.anatomy.cut = whole, None
     looping.next()
-    assert changed == [1, 0]
+    assert changed == [1, 0] and looping.viewer.settings.view.phase == "Excise"
 
 
 def test_each_frame_goes_to_the_link_as_it_is_shown(looping, sent):

@@ -21,10 +21,12 @@ from render import background_image, display, transducer_shape, ultrasound_panel
 from render.camera import OrbitCamera
 from render.cut_face import FLESH
 from render.display import display_available, fitted, scale_of, window_size
+from render.phases import tools_of
 from render.sliders import boxes_of, draw_sliders
 from render.software_scene import SoftwareScene
 from render.viewer import Geometry, TransducerHousing, View
 from render.warning_box import warning_image, warning_rect
+from render.window import Window
 from render.window_layout import FULL_SIZE, WindowLayout
 from settings import with_values
 from sim.device import start
@@ -310,9 +312,17 @@ def test_organ_is_drawn_where_the_camera_projects_it(window):
         assert np.allclose(drawn, [outline.min(axis=0), outline.max(axis=0)], atol=1.0)
 
 
+def for_an_engineer(opened: Window) -> None:
+    """Show an engineer's sliders."""
+    change(opened, "view.show_engineer", True)
+    opened._change_layout(dataclasses.replace(opened.layout, has_engineer=True))
+    opened._place_sliders()
+
+
 @pytest.mark.parametrize("window", [False, True], indirect=True)
 def test_organ_never_covers_the_panel_the_title_or_the_readouts(window):
     opened, _, _ = window
+    for_an_engineer(opened)
     opened.camera.zoom(0.01)
     left, bottom, right, top = opened.camera.part
     opened.camera.pan(0.62 - (left + right) / 2, 0.5 - (bottom + top) / 2)
@@ -322,10 +332,12 @@ def test_organ_never_covers_the_panel_the_title_or_the_readouts(window):
     red = _organ_pixels(picture)
     layout = opened.layout
     assert red[layout.scene.slices][:, -1].any(), "the organ does not reach the panel: this proves nothing"
-    expected = background_image.backdrop(layout, _view())
+    tools = tools_of(layout, opened.settings, opened.keys)
+    assert tools
+    expected = background_image.backdrop(layout, _view(), tools=tools)
     ultrasound_panel.paste_image(expected, layout.image_boxes(1, 40.0, 60.0)[0], _view().images["CT"])
-    for rect in (layout.panel, layout.title):
-        assert np.array_equal(picture[rect.slices], expected[rect.slices])
+    for rect in (layout.panel, layout.title, layout.tools):
+        assert np.array_equal(picture[rect.slices], expected[rect.slices]), rect
     assert np.array_equal(picture[layout.readouts.slices], background_image.readout_image(layout, {}))
     warned, image = warning_rect(layout, warnings), warning_image(layout, warnings)
     assert np.array_equal(picture[warned.slices], image)
@@ -418,6 +430,7 @@ def mouse(window, monkeypatch):
 )
 def test_only_a_box_of_sliders_that_was_moved_is_made_anew(window, mouse, box, way, changes, restored):
     opened, _, _ = window
+    for_an_engineer(opened)
     left, top = opened._slider_boxes[box][:2] if box else opened.layout.panel[:2]
     mouse.goes(left + 30, top + 8)
     opened.read_controls()
@@ -465,9 +478,9 @@ def test_boxes_of_sliders_are_known_again_when_they_come_back():
     for shown in (True, False, True):
         settings = settings_with({"view.show_scanner": shown})
         draw_sliders(Gui(), settings, geometry, boxes_of(settings, geometry, LAYOUT), FULL_SIZE, {})
-    assert len(names) == 5
+    assert len(names) == 3
     draw_sliders(Gui(), settings, geometry, boxes_of(settings, geometry, LAYOUT), FULL_SIZE, {"TGC": 1})
-    assert len(names) == 6
+    assert len(names) == 4
 
 
 @pytest.mark.parametrize("window", [True], indirect=True)
@@ -515,6 +528,7 @@ def test_shift_counts_for_the_keys_pressed_with_it_also_in_a_slow_frame(window, 
 
 def test_other_geometry_has_its_own_sliders(window):
     opened, field, _ = window
+    for_an_engineer(opened)
     faces = opened._geometry.organ[1]
     opened.draw(_view())
     before = opened.picture()
@@ -540,6 +554,7 @@ def test_the_bed_of_a_cut_is_solid_in_a_translucent_organ(window, translucent):
 )
 def test_settings_are_seen(window, setting, value):
     opened, _, _ = window
+    for_an_engineer(opened)
     opened.draw(_view())
     before = opened.picture()
     change(opened, setting, value)

@@ -126,12 +126,12 @@ class Screen:
 
 
 def slider(name: str) -> Rect:
-    """Where a slider of the window is, without its label."""
+    """Where one of an engineer's sliders is, without its label."""
     geometry = Geometry(
         (None, np.zeros((0, 3))), np.zeros((2, 3)), tumour=(1, 1), parts={"vessel": (1, 1)}, support=(1, 1)
     )
-    settings = settings_with()
-    boxes = boxes_of(settings, geometry, WindowLayout(*WINDOW))
+    settings = settings_with({"view.show_engineer": True})
+    boxes = boxes_of(settings, geometry, WindowLayout(*WINDOW, has_engineer=True))
     for group, members in groups_of(settings, geometry).items():
         for place, member in enumerate(members):
             if member.name == name:
@@ -196,6 +196,8 @@ def test_the_mouse_moves_and_presses_the_transducer(screen):
     while not all(each.exists() for each in exported) and time.monotonic() < end:
         time.sleep(0.5)
     assert all(each.exists() for each in exported)
+    screen.do("key", "--window", screen.window, "shift+e")
+    screen.picture()
     level = slider("level_hu")
     screen.point(level.left + level.width // 2, level.top + level.height // 2)
     time.sleep(0.5)
@@ -203,6 +205,7 @@ def test_the_mouse_moves_and_presses_the_transducer(screen):
     screen.point(level.left, level.top + level.height // 2)
     time.sleep(0.5)
     screen.do("mouseup", 1)
+    screen.do("key", "--window", screen.window, "shift+e")
     brighter = screen.picture()
     assert brighter[PANEL].mean() > measured[PANEL].mean() + 10.0, "the slider of the CT changes nothing"
     screen.do("keydown", "Shift_L")
