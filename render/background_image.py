@@ -285,7 +285,9 @@ def clock_image(layout: WindowLayout, box: Rect, clock: str, pace: str) -> np.nd
     draw, letters, middle = ImageDraw.Draw(image), font(layout.px(14)), layout.title.height // 2
     draw.text((box.width, middle), clock, font=letters, fill=TEXT, anchor="rm")
     right = box.width - int(letters.getlength(clock)) - layout.px(12)
-    draw.text((right, middle), pace, font=letters, fill=ALERT, anchor="rm")
+    # A part of it would be another figure.
+    if letters.getlength(pace) < right:
+        draw.text((right, middle), pace, font=letters, fill=ALERT, anchor="rm")
     return np.asarray(image)
 
 

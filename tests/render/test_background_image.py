@@ -297,7 +297,7 @@ def test_all_readouts_of_a_window_are_shown(size):
 
 
 @each_size
-@pytest.mark.parametrize("help_key", ["H", "Backspace"])
+@pytest.mark.parametrize("help_key", ["H", "Return"])
 def test_clock_and_pace_stand_between_title_and_help_in_every_window(size, help_key):
     layout, texts = WindowLayout(*size), {"clock": "1234.5 s", "title": "A long title of a patient " * 5}
     page = BackgroundImage(layout, replace(KEYS, of={**KEYS.of, "help": help_key}))
