@@ -21,13 +21,13 @@ from render import background_image, display, transducer_shape, ultrasound_panel
 from render.camera import OrbitCamera
 from render.cut_face import FLESH
 from render.display import display_available, fitted, scale_of, window_size
-from render.phases import tools_of
+from render.phases import tabs_of, tools_of
 from render.sliders import boxes_of, draw_sliders
 from render.software_scene import SoftwareScene
 from render.viewer import Geometry, TransducerHousing, View
 from render.warning_box import warning_image, warning_rect
 from render.window import Window
-from render.window_layout import FULL_SIZE, WindowLayout
+from render.window_layout import FULL_SIZE, Rect, WindowLayout
 from settings import with_values
 from sim.device import start
 from sim.fields import fill, fill_evenly, zeros
@@ -442,6 +442,38 @@ def test_only_a_box_of_sliders_that_was_moved_is_made_anew(window, mouse, box, w
     mouse.releases(ti.ui.LMB)
     opened.read_controls()
     assert list(opened._boxes_moved) == restored
+
+
+def middle_of(box: Rect) -> tuple[float, float]:
+    return box.left + box.width / 2, box.top + box.height / 2
+
+
+def test_a_click_on_a_phase_or_a_tool_does_what_its_key_does(window, mouse):
+    opened, _, _ = window
+    mouse.goes(*middle_of(tabs_of(opened.layout)["Score"]))
+    mouse.presses(ti.ui.LMB)
+    assert opened.read_controls().settings.view.phase == "Score"
+    mouse.releases(ti.ui.LMB)
+    opened.read_controls()
+    opened._tools = {"undo": opened.layout.tool_row(0), "push": opened.layout.tool_row(1)}
+    mouse.goes(*middle_of(opened.layout.tool_row(0)))
+    mouse.presses(ti.ui.LMB)
+    controls = opened.read_controls()
+    assert controls.undo and not controls.push_mm and not controls.press
+    mouse.releases(ti.ui.LMB)
+    opened.read_controls()
+    # One that acts while its key is held acts as long as the button is.
+    mouse.goes(*middle_of(opened.layout.tool_row(1)))
+    mouse.presses(ti.ui.LMB)
+    pushed = [opened.read_controls().push_mm for _ in range(3)]
+    mouse.releases(ti.ui.LMB)
+    opened.read_controls()
+    assert min(pushed) > 0 and opened.read_controls().push_mm == 0
+    mouse.goes(*middle_of(opened.layout.messages))
+    mouse.presses(ti.ui.LMB)
+    assert opened.read_controls().dismiss
+    mouse.releases(ti.ui.LMB)
+    assert not opened.read_controls().dismiss
 
 
 def test_the_mouse_over_the_scanners_sliders_does_not_move_the_probe(window, mouse):
