@@ -9,7 +9,7 @@ from errors import UserError
 from rehearsal.build_solver import step_settings
 from rehearsal.case import Case
 from render.keys import default_keys
-from render.viewer import WindowSettings
+from render.viewer import RESECTION, WindowSettings
 from scenes.scene import Gravity, Image, SolverSection
 from scenes.tissue import NeoHookeanTissue, Tissue
 from settings import Control, Key, Section, SettingError, settings_in, with_values
@@ -19,7 +19,7 @@ from ultrasound.target import Target
 class PlanSettings(Section):
     """What the next plan is made for, and the margin of plan and cut."""
 
-    margin_mm: Annotated[float, Control("Margin", "Image", is_whole=True)] = Field(5.0, ge=0, le=20)
+    margin_mm: Annotated[float, Control("Margin", RESECTION, is_whole=True)] = Field(5.0, ge=0, le=20)
     plan_for: Annotated[Target, Key("Space", "Plan", "target: tumour and margin, tumour, kidney")] = "margin"
 
 

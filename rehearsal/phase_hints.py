@@ -77,6 +77,8 @@ def _to_cut(resection: ResectionView, settings: CutSettings) -> str:
         )
     depth = "as deep as seen" if settings.depth_mm is None else f"{settings.depth_mm:.0f} mm deep"
     how = f"{settings.technique}, {settings.margin_mm:.0f} mm of margin, {depth}"
+    if (nearest_mm := resection.tumour_mm.min()) < settings.margin_mm - TOLERANCE_MM:
+        how += f"; the line is nearer, {nearest_mm:.1f} mm at least"
     return f"{{cut_out}} cuts along the line: {how}."
 
 

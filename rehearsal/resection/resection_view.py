@@ -126,11 +126,10 @@ class ResectionView:
         if len(self.tumour_mm):
             figures["line to tumour"] = f"{self.tumour_mm.min():.1f} mm"
         depth = "as seen" if settings.depth_mm is None else f"{settings.depth_mm:.0f} mm"
-        return figures | {
-            "margin asked": f"{settings.margin_mm:.0f} mm",
-            "depth": depth,
-            "tumour surface seen": f"{100 * self.seen_share:.0f} %",
-        }
+        figures |= {"margin asked": f"{settings.margin_mm:.0f} mm", "depth": depth}
+        if self._marks:
+            figures["tumour surface seen"] = f"{100 * self.seen_share:.0f} %"
+        return figures
 
     def section(self) -> np.ndarray | None:
         """The coming resection surface on the image plane: segments (n, 2, 2) [mm]; None without one."""

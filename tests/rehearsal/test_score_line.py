@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plan_ball import case_of_ball
 
+from rehearsal.phase_hints import hint
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.operation import _nearest_to_probe
 from rehearsal.resection.proposal import marks_around
@@ -25,6 +26,7 @@ from rehearsal.resection.score_line import (
     score_line,
     with_vertices,
 )
+from render.viewer import Phase
 
 ORGAN = ball(R)
 
@@ -156,8 +158,13 @@ def test_a_mark_of_the_image_is_on_the_capsule_nearest_to_the_probe(across_mm):
         _nearest_to_probe(np.stack([points[:-1], points[1:]], axis=1), 30.0)
 
 
-def test_the_status_of_a_score_says_how_near_and_how_much_was_seen():
+def test_figures_and_hint_of_a_score_say_how_near_it_is_and_how_much_was_seen():
     """A point that is half a millimetre nearer than the margin is not near."""
+
+    def hint_of(phase: Phase, settings: CutSettings) -> str:
+        with_tumour = SimpleNamespace(case=SimpleNamespace(tumour=ORGAN), cut=None)
+        return hint(phase, with_tumour, None, view, settings)
+
     anatomy = SimpleNamespace(
         case=case_of_ball(organ=ORGAN),
         frame=SimpleNamespace(resection=NO_RESECTION.with_marks(circle(7)), time_s=0.0),
@@ -166,15 +173,32 @@ def test_the_status_of_a_score_says_how_near_and_how_much_was_seen():
         skin=lambda points: SimpleNamespace(update=lambda: None, vertices=SimpleNamespace(memory=points)),
     )
     view, wedge = ResectionView(anatomy), CutSettings("wedge", 5.0)
-    assert view.score(5.0) is None and view.status(wedge) == ""
+    assert view.score(5.0) is None and view.figures(wedge) == {
+        "marks": "0",
+        "technique": "wedge",
+        "margin asked": "5 mm",
+        "depth": "as seen",
+    }
     view.update(wedge, lambda points: np.ones(len(points), bool))
     view.tumour_mm, view.seen_share = np.array([4.6, 3.27, 9.0]), 0.63
     length = f"{score_line(ORGAN, circle(7)).length_mm:.0f}"
-    assert view.status(wedge) == (
-        f"tumour surface seen 63 %   red: 3.3 of 5 mm margin   SCORE 7 marks {length} mm   wedge"
-    )
+    assert view.figures(wedge) == {
+        "marks": "7",
+        "technique": "wedge",
+        "line": f"{length} mm",
+        "line to tumour": "3.3 mm",
+        "margin asked": "5 mm",
+        "depth": "as seen",
+        "tumour surface seen": "63 %",
+    }
+    assert "red where it is nearer to the tumour than the 5 mm asked, 3.3 mm" in hint_of("Score", wedge)
+    assert "surface: 63 %" in hint_of("Excise", wedge)
     assert view.score(5.0).is_near.tolist() == [False, True, False]
-    assert view.status(CutSettings("enucleation", 3.5, 12.0)) == f"SCORE 7 marks {length} mm   enucleation"
+    deep = CutSettings("enucleation", 3.5, 12.0)
+    assert "keeps 3.3 mm" in hint_of("Score", deep) and view.figures(deep)["depth"] == "12 mm"
+    assert hint_of("Excise", deep).endswith("enucleation, 4 mm of margin, 12 mm deep.")
+    nearer = hint_of("Excise", CutSettings("wedge", 5.0, 12.0))
+    assert nearer.endswith("wedge, 5 mm of margin, 12 mm deep; the line is nearer, 3.3 mm at least.")
 
 
 def test_marks_are_added_until_there_are_too_many_or_a_cut():
