@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from render.keys import Keys, default_keys
+from render.table_box import table_image, table_rect
 from render.text import fitting_size, font, shortened
 from render.ultrasound_panel import (
     ALERT,
@@ -103,6 +104,7 @@ class BackgroundImage:
             len(findings),
             view.warnings,
             taken,
+            table_rect(self.layout, view.table),
         )
         if self._shows_help or self._backdrop != parts:
             self._rows[:, :, :3] = backdrop(self.layout, view, self.keys.of["help"])
@@ -122,6 +124,8 @@ class BackgroundImage:
             self._axes = axes
         if (warned := self._warning_rect(view)) is not None:
             self._put(warned, warning_image(self.layout, view.warnings, self._taken))
+        if view.table is not None and (box := table_rect(self.layout, view.table)) is not None:
+            self._put(box, table_image(self.layout, view.table))
 
     def draw_scene(self, draw: Callable[[np.ndarray], None]) -> None:
         """Draw the 3D view into ``pixels``, behind what ``compose`` has drawn; ``draw`` does it."""
@@ -134,10 +138,11 @@ class BackgroundImage:
         self.has_scene = True
 
     def boxes_over_scene(self, view: View) -> list[Rect]:
-        """The boxes that cover the 3D view: compass, findings, warnings."""
+        """The boxes that cover the 3D view: compass, findings, warnings, table."""
         count = min(len(view.findings), self.layout.most_findings)
         findings = self.layout.findings(count) if count else None
-        boxes = self.layout.compass, findings, self._warning_rect(view)
+        table = table_rect(self.layout, view.table)
+        boxes = self.layout.compass, findings, self._warning_rect(view), table
         return [box for box in boxes if box is not None]
 
     def _warning_rect(self, view: View) -> Rect | None:
