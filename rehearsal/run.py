@@ -136,7 +136,7 @@ class RehearsalRun:
             self.files.warnings,
             self.files.folder,
             self.attempts,
-            QuitCheck(self.notices, self.anatomy.frame, self._recorded_at),
+            QuitCheck(self.notices, self._acted_at),
         )
         loop = WindowLoop(
             viewer, self.built.stepper, source, self.anatomy, self.measurements, observers, panel
@@ -286,7 +286,7 @@ class RehearsalRun:
             self._end()
             _echo(_verdict(check, self.anatomy.frame))
 
-    def _recorded_at(self) -> float | None:
+    def _acted_at(self) -> float | None:
         return None if self.recording is None else self.recording.action_at
 
     def _save_page(self, report: dict[str, Any], number: int) -> None:
@@ -295,9 +295,8 @@ class RehearsalRun:
 
         click.echo("\n".join(f"{name:<21}  {value}" for name, value in rows_of(report)))
         try:
-            click.echo(
-                "Saved " + " and ".join(map(str, save_page(self.anatomy, report, self.options.out, number)))
-            )
+            files = save_page(self.anatomy, report, self.options.out, number)
+            click.echo("Saved " + " and ".join(map(str, files)))
         except OSError as error:
             click.echo(f"Warning: the page of the resection is not saved: {error.strerror}")
 
@@ -348,19 +347,21 @@ class Recording:
     def __init__(self, run: RehearsalRun, is_replay: bool) -> None:
         self._run = run
         self.recorder: SessionRecorder | None = None
-        # When an action of the user was recorded last, by the clock [s].
+        # When the user acted last, by the clock [s]; None in a replay.
         self.action_at: float | None = None
+        self._is_replay = is_replay
         if not is_replay:
             self._begin(None)
 
     def observe(self, frame: Frame, probe: Probe) -> None:
         """As ``Observer.observe``."""
         if frame.begins is not None:
+            self._is_replay = False
             self._begin(frame.begins)
+        events = () if self._is_replay else frame.of_session.events
+        if any(isinstance(e, Applied) and not isinstance(e.command, SetValues) for e in events):
+            self.action_at = perf_counter()
         if self.recorder is not None:
-            events = frame.of_session.events
-            if any(isinstance(e, Applied) and not isinstance(e.command, SetValues) for e in events):
-                self.action_at = perf_counter()
             self.recorder.observe(frame.of_session)
 
     def close(self, stepper: Stepper, summary: dict[str, Any]) -> SessionRecorder | None:

@@ -82,7 +82,7 @@ class WindowPanel:
         self.out, self.keys, self.counts, self.link = out, keys, counts, link
         self.warnings, self.folder = warnings, folder
         self.attempts = attempts or AttemptFigureList(anatomy)
-        self.quit_check = quit_check or QuitCheck(notices, anatomy.frame)
+        self.quit_check = quit_check or QuitCheck(notices)
         self._shows_attempts = False
         self.sweeping = SweepRecorder(anatomy, notices)
         self.cine, self.caliper = Cine(), Caliper()

@@ -124,8 +124,8 @@ class BackgroundImage:
             self._axes = axes
         if (warned := self._warning_rect(view)) is not None:
             self._put(warned, warning_image(self.layout, view.warnings, self._taken))
-        if view.table is not None and (box := table_rect(self.layout, view.table)) is not None:
-            self._put(box, table_image(self.layout, view.table))
+        if view.table is not None and (over := table_rect(self.layout, view.table)) is not None:
+            self._put(over, table_image(self.layout, view.table))
 
     def draw_scene(self, draw: Callable[[np.ndarray], None]) -> None:
         """Draw the 3D view into ``pixels``, behind what ``compose`` has drawn; ``draw`` does it."""

@@ -95,10 +95,8 @@ class AttemptFigureList:
         if request is None:
             raise ValueError("expected an attempt with a cut")
         judgement = self._anatomy.judgement_of(attempt.resection)[0]
-        settings = request.settings
-        return figures_of_attempt(
-            attempt.number, settings.technique, settings.margin_mm, judgement, self._plan
-        )
+        how = request.settings.technique, request.settings.margin_mm
+        return figures_of_attempt(attempt.number, *how, judgement, self._plan)
 
 
 def figures_of_attempt(
@@ -148,11 +146,9 @@ def _in_words(attempt: AttemptFigures) -> str:
     if attempt.margin_min_mm is None:
         return f"{how}: not judged"
     opened, divided = attempt.collecting_system_opened_mm2, attempt.vessels_divided
-    points = (
-        ""
-        if attempt.points is None
-        else f"; {attempt.points:.1f} points, planned {attempt.planned_points:.1f}"
-    )
+    points = ""
+    if attempt.points is not None:
+        points = f"; {attempt.points:.1f} points, planned {attempt.planned_points:.1f}"
     return (
         f"{how}: {attempt.margin_min_mm:.1f} mm least, {attempt.margin_mean_mm:.1f} mm mean; parenchyma "
         f"{attempt.parenchyma_removed_ml:.1f} ml; collecting system "
