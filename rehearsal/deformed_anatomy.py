@@ -15,7 +15,7 @@ from rehearsal.case import Case
 from rehearsal.loop.frame import Frame, RestGeometry
 from rehearsal.resection.cut import Cut
 from rehearsal.resection.judgement import Carried, Judgement, judge
-from rehearsal.resection.resection_state import Resection
+from rehearsal.resection.resection_state import Resection, cut_of
 from rehearsal.resection.score_line import ResectionError
 from rehearsal.tissue_voxels import tissue_voxels
 from scenes.anatomy import Grid, LoadedAnatomy
@@ -61,7 +61,7 @@ class DeformedAnatomy:
         self._carrier = interpolation.carrier()
         meshes = [shape for shape in case.shapes if isinstance(shape, trimesh.Trimesh)]
         self.supports = [_shrunk(translated(mesh, -case.origin), SUPPORT_SUNK_MM) for mesh in meshes]
-        self._judged: tuple[Resection, Judgement | None, str] | None = None
+        self._judged: dict[Resection, tuple[Judgement | None, str]] = {}
         self._skins: dict[str, Skin] = {}
         self._fine: tuple[FineSurface, Skin] | None = None
         self._version = -1
@@ -205,12 +205,13 @@ class DeformedAnatomy:
 
     # A cut
 
-    def carried_then(self, points: np.ndarray) -> np.ndarray:
-        """Where points (n, 3) [mm] of the whole organ at rest were when it was cut.
+    def carried_then(self, points: np.ndarray, resection: Resection | None = None) -> np.ndarray:
+        """Where points (n, 3) [mm] of the whole organ at rest were when it was cut, as the present resection
+        or another one has it.
 
         Raises ResectionError without a cut.
         """
-        request = self.frame.resection.cut
+        request = (resection or self.frame.resection).cut
         if request is None:
             raise ResectionError("nothing was cut yet")
         return self.geometry.whole.carried(np.asarray(points, float), request.nodes_mm)  # type: ignore[attr-defined]
@@ -233,28 +234,40 @@ class DeformedAnatomy:
         """The figures of the cut; None without a cut, without a tumour to judge by, or where
         ``judgement_fault`` says why there are none.
         """
-        return self._judgement_of(self.frame.resection)[0]
+        return self.judgement_of(self.frame.resection)[0]
 
     @property
     def judgement_fault(self) -> str:
         """Why there are no figures of the cut; empty where there are, or nothing was cut."""
-        return self._judgement_of(self.frame.resection)[1]
+        return self.judgement_of(self.frame.resection)[1]
 
-    def _judgement_of(self, resection: Resection) -> tuple[Judgement | None, str]:
-        cut, tumour = self.cut, self.case.tumour
-        if cut is None or tumour is None:
+    def judgement_of(self, resection: Resection) -> tuple[Judgement | None, str]:
+        """The figures of a cut of this session, also of one that was undone; None without a cut or a tumour,
+        and where the text says why there are none.
+        """
+        tumour = self.case.tumour
+        if resection.cut is None or tumour is None:
             return None, ""
-        if self._judged is None or self._judged[0] != resection:
-            surfaces = (self.case.organ, cut.specimen, cut.remnant, tumour)
-            as_cut = Carried(*(self.carried_then(surface.vertices) for surface in surfaces))
-            labels, tissues = self._labels
-            moved = labels and Grid(labels.voxels, labels.index_from_mm @ shift_by(self.case.origin))
-            inputs = cut, self.case.organ, tumour, self.case.parts, as_cut, moved, tissues
+        if resection not in self._judged:
             try:
-                self._judged = resection, judge(*inputs), ""
-            except PatientError as error:
-                self._judged = resection, None, f"no figures of the cut: {error}"
-        return self._judged[1:]
+                self._judged[resection] = self._judge(resection, tumour), ""
+            except (PatientError, ResectionError) as error:
+                self._judged[resection] = None, f"no figures of the cut: {error}"
+        return self._judged[resection]
+
+    def _judge(self, resection: Resection, tumour: trimesh.Trimesh) -> Judgement | None:
+        """Judge a cut, which is made anew where it is not the present one. Raises PatientError,
+        ResectionError.
+        """
+        organ, is_present = self.case.organ, resection == self.frame.resection
+        cut = self.cut if is_present else cut_of(resection, organ, tumour)
+        if cut is None:
+            return None
+        surfaces = organ, cut.specimen, cut.remnant, tumour
+        as_cut = Carried(*(self.carried_then(surface.vertices, resection) for surface in surfaces))
+        labels, tissues = self._labels
+        moved = labels and Grid(labels.voxels, labels.index_from_mm @ shift_by(self.case.origin))
+        return judge(cut, organ, tumour, self.case.parts, as_cut, moved, tissues)
 
 
 class ScannedCt:

@@ -1,5 +1,6 @@
 """A rehearsal without a screen: the scripted press, or a recorded session."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -140,10 +141,11 @@ def run_headless(
     draws: bool = True,
     plan: ResectionPlan | None = None,
     about: dict[str, Any] | None = None,
+    attempts: Callable[[], list[dict[str, Any]]] = list,
 ) -> None:
     """Compute so many steps; write surfaces and report.json, and where it ``draws``, images too.
 
-    ``about`` is what else the report says, of the patient.
+    ``about`` is what else the report says, of the patient; ``attempts`` gives the figures of the cuts.
     """
     rehearsal = loop.rehearsal
     drawn = loop.run(steps, out, draws)
@@ -153,6 +155,8 @@ def run_headless(
         from rehearsal.resection.resection_page import report_of
 
         report |= dict(resection=report_of(rehearsal.anatomy, plan))
+    if figures := attempts():
+        report |= dict(attempts=figures)
     write_json(report, out / "report.json")
     click.echo(summary(report))
     click.echo(f"Wrote {' and '.join([*drawn, 'report.json'])} to {out}")

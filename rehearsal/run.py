@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
+from time import perf_counter
 from typing import Any
 
 import click
@@ -17,8 +18,8 @@ from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.headless import HeadlessLoop, run_headless
 from rehearsal.input_files import InputFiles
 from rehearsal.live_settings import LiveSettings, initial_settings
-from rehearsal.loop.command import Checkpoint
-from rehearsal.loop.frame import Checkpointed, Frame
+from rehearsal.loop.command import Checkpoint, SetValues
+from rehearsal.loop.frame import Applied, Checkpointed, Frame
 from rehearsal.loop.protocols import Observer, Source, Stepper
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally
@@ -26,13 +27,15 @@ from rehearsal.measurements.session_summary import summary_text
 from rehearsal.notices import Notices
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plans_in_window import PlanControl
+from rehearsal.quit_check import QuitCheck
 from rehearsal.real_time.solver_process import SolverEnded
 from rehearsal.real_time.start_times import StartTimes
 from rehearsal.rehearsal import Rehearsal, script_length_s, scripted_pose
+from rehearsal.resection.attempts import AttemptFigureList, attempts_text
 from rehearsal.resection.resection_state import ResectionScript
 from rehearsal.resection.resection_view import ResectionView
 from rehearsal.sessions.packed_arrays import pack_seen
-from rehearsal.sessions.recorder import SessionRecorder, header_of, next_path
+from rehearsal.sessions.recorder import SessionRecorder, header_of, next_path, number_of
 from rehearsal.sessions.replay import Replay, ReplayCheck, open_session
 from rehearsal.sessions.session_file import Header, Log
 from rehearsal.sources.scripted import ReplaySource, ScriptedPress
@@ -97,6 +100,7 @@ class RehearsalRun:
         guide = None if plan is None else PlanGuidance(self.anatomy.case, self.manipulator, plan)
         self.measurements = LiveMeasurements(self.anatomy, self.manipulator, guide, self.files.bands)
         self.resection = ResectionView(self.anatomy, self.files.resection_plan)
+        self.attempts = AttemptFigureList(self.anatomy, self.files.resection_plan)
 
     def in_window(self, prepare: Callable[[WindowLoop], None] = lambda loop: None) -> None:
         """Run in the window, after a replay if there is one; ``prepare`` is called with its loop before the
@@ -116,6 +120,7 @@ class RehearsalRun:
         click.echo(self.files.keys.worded(text))
         announcements = Announcements(self.anatomy, self.notices)
         plans = PlanControl(self.anatomy.case, self.loaded, self.measurements, self.options.out, self.notices)
+        observers = self._observers(announcements, check)
         panel = WindowPanel(
             self.anatomy,
             source,
@@ -129,8 +134,9 @@ class RehearsalRun:
             self.link,
             self.files.warnings,
             self.files.folder,
+            self.attempts,
+            QuitCheck(self.notices, self._acted_at),
         )
-        observers = self._observers(announcements, check)
         loop = WindowLoop(
             viewer, self.built.stepper, source, self.anatomy, self.measurements, observers, panel
         )
@@ -176,14 +182,15 @@ class RehearsalRun:
         )
         with self._summarised(check):
             draws, about = not self.options.no_pictures, self._about_patient()
-            run_headless(loop, steps, self.arch, self.options.out, draws, self.files.resection_plan, about)
+            plan, attempts = self.files.resection_plan, self.attempts
+            run_headless(loop, steps, self.arch, self.options.out, draws, plan, about, attempts.report)
 
     def _observers(self, announcements: Announcements, check: ReplayCheck | None) -> list[Observer]:
         """Those of each frame, in this order: beside a whole state the coverage is recorded, with the
         image of that state.
         """
         self.recording = Recording(self, is_replay=check is not None)
-        observers: list[Observer] = [self.measurements, self.recording, announcements]
+        observers: list[Observer] = [self.measurements, self.recording, self.attempts, announcements]
         return observers if check is None else [*observers, check]
 
     def _about_patient(self) -> dict[str, Any]:
@@ -278,13 +285,17 @@ class RehearsalRun:
             self._end()
             _echo(_verdict(check, self.anatomy.frame))
 
-    def _save_page(self, report: dict[str, Any]) -> None:
-        """Write the page of the resection, and print its figures."""
+    def _acted_at(self) -> float | None:
+        return None if self.recording is None else self.recording.action_at
+
+    def _save_page(self, report: dict[str, Any], number: int) -> None:
+        """Write the page of the resection of a session's number, and print its figures."""
         from rehearsal.resection.resection_page import rows_of, save_page
 
         click.echo("\n".join(f"{name:<21}  {value}" for name, value in rows_of(report)))
         try:
-            click.echo("Saved " + " and ".join(map(str, save_page(self.anatomy, report, self.options.out))))
+            files = save_page(self.anatomy, report, self.options.out, number)
+            click.echo("Saved " + " and ".join(map(str, files)))
         except OSError as error:
             click.echo(f"Warning: the page of the resection is not saved: {error.strerror}")
 
@@ -305,17 +316,21 @@ class RehearsalRun:
         bookmarks = len(self.anatomy.frame.bookmarks)
         summary, report = self.measurements.summary(bookmarks), self._resection_report()
         click.echo(summary_text(summary))
+        _echo(attempts_text(self.attempts.figures))
+        if self.attempts.figures:
+            summary |= dict(attempts=self.attempts.report())
         if report is not None:
             summary |= dict(resection=report)
         elif self.files.resection_plan is not None:
-            click.echo("resection   nothing was cut: there is nothing to compare with the plan")
+            click.echo("resection   no cut at the end: there is nothing to compare with the plan")
         guide = self.measurements.guide
         if guide is not None:
             _echo(guide.in_words(summary.get(f"seen_{guide.plan.target}")))
         recorder = None if self.recording is None else self.recording.close(self.built.stepper, summary)
         # After the session is safe.
         if report is not None:
-            self._save_page(report)
+            path = next_path(self.options.out) if recorder is None else recorder.path
+            self._save_page(report, number_of(path))
         if recorder is not None:
             scene = [] if self.options.scene == EMBEDDED else [self.options.scene]
             again = shell_command("rehearse", *scene, "--replay", recorder.path)
@@ -331,13 +346,20 @@ class Recording:
     def __init__(self, run: RehearsalRun, is_replay: bool) -> None:
         self._run = run
         self.recorder: SessionRecorder | None = None
+        # When the user acted last, by the clock [s]; None in a replay.
+        self.action_at: float | None = None
+        self._is_replay = is_replay
         if not is_replay:
             self._begin(None)
 
     def observe(self, frame: Frame, probe: Probe) -> None:
         """As ``Observer.observe``."""
         if frame.begins is not None:
+            self._is_replay = False
             self._begin(frame.begins)
+        events = () if self._is_replay else frame.of_session.events
+        if any(isinstance(e, Applied) and not isinstance(e.command, SetValues) for e in events):
+            self.action_at = perf_counter()
         if self.recorder is not None:
             self.recorder.observe(frame.of_session)
 

@@ -89,6 +89,8 @@ class WindowLoop:
             self.frozen = not self.frozen
             self.times.restart()
         self.panel.control(controls, self.frozen)
+        if controls.quit and self.panel.quit_check.quits(self.anatomy.frame):
+            self.window.quit()
         return replace(controls, frozen=self.frozen)
 
     def _submit(self, frame: Frame, controls: Controls[LiveSettings]) -> None:

@@ -23,7 +23,9 @@ from rehearsal.message_log import MessageLog
 from rehearsal.notices import Notices
 from rehearsal.phase_hints import hint
 from rehearsal.planning.plans_in_window import PlanControl
+from rehearsal.quit_check import QuitCheck
 from rehearsal.real_time.frame_times import FrameTimes
+from rehearsal.resection.attempts import AttemptFigureList
 from rehearsal.resection.resection_view import ResectionView, cut_settings
 from rehearsal.sources.scripted import ReplaySource
 from rehearsal.sources.user import UserSource
@@ -47,7 +49,8 @@ class WindowPanel:
     """Adds to a view what the user reads, and does what the keys ask for that changes no tissue.
 
     ``folder`` is the scene's: the patient's, where one was imported; ``warnings`` of the import are those
-    that nobody has acknowledged. ``counts`` are the sizes of the tissue model.
+    that nobody has acknowledged. ``counts`` are the sizes of the tissue model. ``quit_check`` decides
+    whether the key to quit does.
     """
 
     def __init__(
@@ -64,11 +67,16 @@ class WindowPanel:
         link: OpenIGTLinkServer | None = None,
         warnings: tuple[str, ...] = (),
         folder: Path = Path(),
+        attempts: AttemptFigureList | None = None,
+        quit_check: QuitCheck | None = None,
     ) -> None:
         self.anatomy, self.source, self.measurements = anatomy, source, measurements
         self.resection, self.plans, self.notices = resection, plans, notices
         self.out, self.keys, self.counts, self.link = out, keys, counts, link
         self.warnings, self.folder = warnings, folder
+        self.attempts = attempts or AttemptFigureList(anatomy)
+        self.quit_check = quit_check or QuitCheck(notices)
+        self._shows_attempts = False
         self.sweeping = SweepRecorder(anatomy, notices)
         self.cine, self.caliper, self.messages = Cine(), Caliper(), MessageLog()
         self._frozen = False
@@ -99,6 +107,7 @@ class WindowPanel:
             self.messages.dismiss()
         if controls.acknowledge and self.warnings:
             self._try(self._acknowledge)
+        self._shows_attempts ^= controls.show_attempts
         self.plans.control(controls)
 
     def present(
@@ -129,6 +138,7 @@ class WindowPanel:
             caliper=self.caliper.figure(shown),
             readouts=figures | _speeds(times),
             warnings=self._warnings(),
+            table=self.attempts.table() if self._shows_attempts else None,
             clock=f"{time_s:.1f} s",
             pace=self._pace(times),
             status=self._status(view),

@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw
 from render.keys import Keys, default_keys
 from render.message_box import log_image, message_image
 from render.phases import GAP_PX, TAB_PX, TOOL_PX, Tool, tabs_of
+from render.table_box import table_image, table_rect
 from render.text import fitting_size, font, shortened
 from render.ultrasound_panel import (
     ALERT,
@@ -111,6 +112,7 @@ class BackgroundImage:
             len(findings),
             view.warnings,
             taken,
+            table_rect(self.layout, view.table),
         )
         if self._page or self._backdrop != parts:
             self._rows[:, :, :3] = backdrop(self.layout, view, self.keys.of["help"], *self._tools)
@@ -134,6 +136,8 @@ class BackgroundImage:
             self._axes = axes
         if (warned := self._warning_rect(view)) is not None:
             self._put(warned, warning_image(self.layout, view.warnings, self._taken))
+        if view.table is not None and (over := table_rect(self.layout, view.table)) is not None:
+            self._put(over, table_image(self.layout, view.table))
 
     def put_tools(self, phase: Phase, tools: list[Tool]) -> None:
         """Have the tools of a phase in the images that follow."""
@@ -151,10 +155,11 @@ class BackgroundImage:
         self.has_scene = True
 
     def boxes_over_scene(self, view: View) -> list[Rect]:
-        """The boxes that cover the 3D view: compass, findings, warnings."""
+        """The boxes that cover the 3D view: compass, findings, warnings, table."""
         count = min(len(view.findings), self.layout.most_findings)
         findings = self.layout.findings(count) if count else None
-        boxes = self.layout.compass, findings, self._warning_rect(view)
+        table = table_rect(self.layout, view.table)
+        boxes = self.layout.compass, findings, self._warning_rect(view), table
         return [box for box in boxes if box is not None]
 
     def _warning_rect(self, view: View) -> Rect | None:

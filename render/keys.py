@@ -52,6 +52,8 @@ KEY_MAP = {
         "score: marks beside the tumour's edges in the image": {"score_image": "Shift+M"},
         "score: the marks of the planned line, instead of any others": {"score_planned": "Shift+L"},
         "cut along the score": {"cut_out": "Shift+X"},
+        "return to the next attempt, undone or not": {"next_attempt": "Shift+N"},
+        "show or hide the table of attempts": {"show_attempts": "Shift+H"},
     },
     "Plan": {
         "plan a sweep of the target": {"plan": "Return"},
@@ -63,11 +65,11 @@ KEY_MAP = {
         "start and stop recording a tracked sweep": {"sweep": "L"},
         "take control from a replay or a tracked probe": {"take_over": "K"},
         "warnings of the import: checked": {"acknowledge": "Shift+I"},
-        "reset tissue, transducer and view": {"reset": "R"},
+        "reset tissue, probe, marks and view; undo restores all but the view": {"reset": "R"},
         "save a screenshot of the window": {"screenshot": "P"},
         "show or hide this list": {"help": "H"},
         "show or hide the messages of the session": {"log": "Shift+H"},
-        "quit": {"quit": "Esc"},
+        "quit, asked once more after something was done": {"quit": "Esc"},
     },
 }
 DEFAULT_BUTTONS = {

@@ -141,6 +141,16 @@ class Score:
 
 
 @dataclass(frozen=True)
+class Table:
+    """A table of texts under headings; ``marked`` is the index of the row that is marked, if one is."""
+
+    title: str
+    headings: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    marked: int | None = None
+
+
+@dataclass(frozen=True)
 class View:
     """The content of one frame."""
 
@@ -214,6 +224,8 @@ class View:
     """Warnings that nobody has acknowledged, of the import."""
     title: str = ""
     """Scene or case; no identifiers of the patient."""
+    table: Table | None = None
+    """A table over the 3D view, such as of the attempts."""
 
     @property
     def shown(self) -> dict[str, np.ndarray]:
@@ -254,6 +266,10 @@ class Controls(Generic[UserSettings]):
     redo: bool = False
     bookmark: bool = False
     to_bookmark: bool = False
+    next_attempt: bool = False
+    """Restore the state right after the next cut of this session."""
+    show_attempts: bool = False
+    """Show or hide the table of the attempts."""
     sweep: bool = False
     """Start or stop recording a sweep."""
     take_over: bool = False
@@ -288,7 +304,7 @@ class Controls(Generic[UserSettings]):
     @property
     def restores(self) -> bool:
         """Whether a state is restored or kept."""
-        return self.reset or self.undo or self.redo or self.bookmark or self.to_bookmark
+        return self.reset or self.undo or self.redo or self.bookmark or self.to_bookmark or self.next_attempt
 
     @property
     def operates(self) -> bool:

@@ -158,7 +158,7 @@ class Window(Generic[UserSettings]):
         return not self._quit and (self._window.running if self._visible else True)
 
     def quit(self) -> None:
-        """Run no longer, as after the user's key."""
+        """Run no longer."""
         self._quit = True
 
     def read_controls(self) -> Controls[UserSettings]:
@@ -189,7 +189,6 @@ class Window(Generic[UserSettings]):
             self._gamepad.read(controls, elapsed)
         if controls.reset:
             self.camera.go_home()
-        self._quit = self._quit or controls.quit
 
     def _read_cursor(self) -> None:
         cursor = np.array(self._window.get_cursor_pos(), dtype=np.float64)
@@ -375,6 +374,9 @@ class Window(Generic[UserSettings]):
     def _place_sliders(self) -> None:
         """Have the boxes of the present settings."""
         boxes = boxes_of(self.settings, self._geometry, self.layout)
+        if self._view is not None and self._view.table is not None:
+            # The table has the width of the 3D view.
+            boxes = {name: box for name, box in boxes.items() if box.top >= self.layout.strip.top}
         if boxes != self._slider_boxes:
             self._slider_boxes, self._warm_up = boxes, 2
 

@@ -28,6 +28,9 @@ class NullViewer:
         self._running = self._running and not controls.quit
         return controls
 
+    def quit(self) -> None:
+        self._running = False
+
     def image_shape(self, count: int, width_mm: float, depth_mm: float) -> tuple[int, int]:
         return self._size
 

@@ -118,7 +118,7 @@ class Mark(_Command):
 
 
 class CutOut(_Command):
-    """A cut along the score: an action.
+    """A cut along the score: an action. The state after it is kept as an attempt, and recorded whole.
 
     See ``CutSettings``; ``seen`` has a bit for each vertex of the tumour's surface, as base64.
     """
@@ -156,7 +156,7 @@ class Bookmark(_Command):
 
 
 class GoTo(_Command):
-    """Restore the state of a bookmark, by its number: an action."""
+    """Restore the state of a bookmark or of an attempt, by its number: an action."""
 
     kind: Literal["go to"] = "go to"
     state: int = Field(ge=0)

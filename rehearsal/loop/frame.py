@@ -9,7 +9,7 @@ from rehearsal.case import Case
 from rehearsal.loop.command import Load, Recorded
 from rehearsal.loop.state import WholeState
 from rehearsal.resection.cut import Cut
-from rehearsal.resection.resection_state import NO_RESECTION, Resection
+from rehearsal.resection.resection_state import NO_RESECTION, Attempt, Resection
 from sim.skinning import Interpolation
 from ultrasound.probe_manipulator import ManipulatorState
 
@@ -113,7 +113,8 @@ class Frame:
     ``pose`` where the tissue lets it be. ``wrench`` (6,): force [N] on the probe, and torque [N mm]
     about the centre of the array face (LPS); ``sliding_share`` and ``friction_ratio`` are those of
     ``sim.surface_contact.ContactLoad``. ``kept`` are the numbers of the states that undo, redo and
-    ``bookmarks`` may restore. ``pace`` says how steps differ from what is set.
+    ``bookmarks`` may restore; ``attempts`` are the cuts of this session, undone or not. ``pace`` says how
+    steps differ from what is set.
     """
 
     number: int
@@ -130,6 +131,7 @@ class Frame:
     manipulator: ManipulatorState | None = None
     kept: frozenset[int] = frozenset()
     bookmarks: tuple[int, ...] = ()
+    attempts: tuple[Attempt, ...] = ()
     pace: str = ""
     events: tuple[Event, ...] = field(default=(), repr=False)
 
@@ -156,6 +158,12 @@ class Frame:
         """The event with which a session began since the frame before, if one did."""
         events = [event for event in self.events if isinstance(event, Checkpointed) and event.begins]
         return events[-1] if events else None
+
+    @property
+    def present_attempt(self) -> Attempt | None:
+        """The attempt whose cut the tissue has; None without a cut."""
+        made = [attempt for attempt in self.attempts if attempt.resection == self.resection]
+        return made[-1] if made else None
 
     @property
     def steps(self) -> list[Step]:

@@ -28,18 +28,24 @@ class WholeState:
 class History:
     """Undo, redo and bookmarks as a value.
 
-    Numbers of states: ``before`` each action that can be undone, those that were ``undone``, and
-    ``bookmarks``, the newest last.
+    Numbers of states: ``before`` each action that can be undone, those that were ``undone``, ``bookmarks``,
+    and right after each cut (``attempts``), the newest last.
     """
 
     before: tuple[int, ...] = ()
     undone: tuple[int, ...] = ()
     bookmarks: tuple[int, ...] = ()
+    attempts: tuple[int, ...] = ()
 
     @property
     def numbers(self) -> frozenset[int]:
         """All states that may be restored."""
-        return frozenset((*self.before, *self.undone, *self.bookmarks))
+        return frozenset((*self.before, *self.undone, *self.marked_states))
+
+    @property
+    def marked_states(self) -> tuple[int, ...]:
+        """Bookmarks and attempts: what ``GoTo`` may restore."""
+        return (*self.bookmarks, *self.attempts)
 
     def begun(self, now: int) -> "History":
         """After an action began in a state: what was undone before it cannot be redone."""
@@ -65,3 +71,7 @@ class History:
     def marked(self, now: int) -> "History":
         """With a bookmark of a state."""
         return replace(self, bookmarks=(*self.bookmarks, now))
+
+    def attempted(self, now: int) -> "History":
+        """With an attempt: the state right after a cut."""
+        return replace(self, attempts=(*self.attempts, now))

@@ -42,9 +42,9 @@ from rehearsal.loop.frame import (
 )
 from rehearsal.loop.state import History, WholeState
 from rehearsal.pressed_organ import PressedOrgan
-from rehearsal.resection.cut import Cut, CutSettings, check_hilum, cut_organ, hilum_of, part_left
-from rehearsal.resection.resection_state import NO_RESECTION, CutRequest, Resection
-from rehearsal.resection.score_line import ResectionError, score_line
+from rehearsal.resection.cut import Cut, CutSettings, check_hilum, hilum_of, part_left
+from rehearsal.resection.resection_state import NO_RESECTION, Attempt, CutRequest, Resection, cut_of
+from rehearsal.resection.score_line import ResectionError
 from settings import Value, with_values
 from sim.fields import array_of
 from sim.skinning import ClusterCarrier
@@ -71,6 +71,7 @@ class Timeline:
         self.number, self.time_s = 0, 0.0
         self.history = History()
         self.resection = NO_RESECTION
+        self.attempts: tuple[Attempt, ...] = ()
         self._manipulator: ManipulatorState | None = None
         self._kept = {SETTLED: WholeState(organ.snapshot())}
         self._whole = whole_geometry(organ.case, organ.model.carrier.interpolation)
@@ -152,6 +153,7 @@ class Timeline:
             manipulator=self._manipulator,
             kept=frozenset(self._kept),
             bookmarks=self.history.bookmarks,
+            attempts=self.attempts,
             events=events,
         )
 
@@ -173,7 +175,9 @@ class Timeline:
         self._events.append(Applied(number, command, restored))
         if isinstance(command, Mark | CutOut) or restored is not None:
             self._end_state()
-        if isinstance(command, Bookmark):
+        if isinstance(command, CutOut):
+            self._keep_attempt()
+        if isinstance(command, Bookmark | CutOut):
             self._checkpoint()
 
     def _do(self, command: Recorded) -> int | None:
@@ -200,9 +204,10 @@ class Timeline:
             case Reset():
                 return self._restore(self.history.begun(self.number), SETTLED)
             case GoTo():
-                is_known = command.state in self.history.bookmarks
+                is_known = command.state in self.history.marked_states
                 number = command.state if is_known else None
-                return self._restore(self.history.begun(self.number), number, "There is no such bookmark")
+                fault = "There is no such bookmark or attempt"
+                return self._restore(self.history.begun(self.number), number, fault)
         return None
 
     def _set(self, values: dict[str, Value]) -> None:
@@ -247,13 +252,10 @@ class Timeline:
 
         Raises ResectionError, PatientError.
         """
-        request, case = resection.cut, self.organ.case
-        if request is None:
+        case = self.organ.case
+        if resection.cut is None:
             return self._whole
-        if resection not in self._cuts:
-            line = score_line(case.organ, resection.points())
-            tumour = np.zeros((0, 3)) if case.tumour is None else np.asarray(case.tumour.vertices)
-            cut = cut_organ(case.organ, line, request.settings, tumour[request.seen_of(len(tumour))])
+        if resection not in self._cuts and (cut := cut_of(resection, case.organ, case.tumour)) is not None:
             check_hilum(cut, case.organ, hilum_of(case.scene.attachment, case.origin))
             self._made_cuts += 1
             self._cuts = dict([*self._cuts.items(), (resection, self._after(cut))][-KEPT_CUTS:])
@@ -297,6 +299,13 @@ class Timeline:
         self._discard()
         return number
 
+    def _keep_attempt(self) -> None:
+        """Keep the present state as another attempt."""
+        self._keep()
+        self.history = self.history.attempted(self.number)
+        attempt = Attempt(len(self.attempts) + 1, self.number, self.resection)
+        self.attempts = (*self.attempts, attempt)
+
     def _keep(self, manipulator: ManipulatorState | None = None) -> None:
         """Keep the present state, with the manipulator's present state or another one."""
         if self.number not in self._kept:
@@ -336,7 +345,7 @@ class Timeline:
         self._events.append(Checkpointed(self.number, state))
 
     def _begin_session(self, pose: np.ndarray | None) -> None:
-        self.number, self.time_s, self.history = 0, 0.0, History()
+        self.number, self.time_s, self.history, self.attempts = 0, 0.0, History(), ()
         self._digested = SETTLED
         self._noted_iterations = self.organ.settings.iterations
         if pose is None:
@@ -358,6 +367,10 @@ class Timeline:
         self.organ.restore(command.state.organ)
         self.number, self.time_s, self.history = command.number, command.time_s, command.history
         self._kept = {SETTLED: self._kept[SETTLED]} | command.kept
+        self.attempts = tuple(
+            Attempt(count, number, self._kept[number].resection)
+            for count, number in enumerate(self.history.attempts, 1)
+        )
 
 
 def _shapes_of(state: WholeState) -> list[tuple]:

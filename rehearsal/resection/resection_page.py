@@ -78,13 +78,14 @@ def _judged(anatomy: DeformedAnatomy) -> tuple[Cut, Judgement, trimesh.Trimesh]:
     return cut, judgement, tumour
 
 
-def save_page(anatomy: DeformedAnatomy, report: dict[str, Any], out: Path) -> list[Path]:
-    """Write ``resection.png`` and ``resection.json`` with a report into a folder; return them.
+def save_page(anatomy: DeformedAnatomy, report: dict[str, Any], out: Path, number: int) -> list[Path]:
+    """Write the page and ``report`` of the session of a number into a folder, as ``resection-001.png`` and
+    ``resection-001.json``; return them.
 
     Raises ResectionError, OSError.
     """
     cut, judgement, tumour = _judged(anatomy)
-    page, figures = out / f"{NAME}.png", out / f"{NAME}.json"
+    page, figures = (out / f"{NAME}-{number:03d}.{ending}" for ending in ("png", "json"))
     draw_page(cut, judgement, tumour, report, page, "Resection")
     write_json(report, figures)
     return [page, figures]

@@ -10,10 +10,11 @@ from functools import cached_property
 from typing import Annotated, Literal
 
 import numpy as np
+import trimesh
 from pydantic import BaseModel, ConfigDict, Field
 
-from rehearsal.resection.cut import CutSettings
-from rehearsal.resection.score_line import ResectionError
+from rehearsal.resection.cut import Cut, CutSettings, cut_organ
+from rehearsal.resection.score_line import ResectionError, score_line
 from render.viewer import Technique
 from ultrasound.crater import Filling
 
@@ -72,6 +73,31 @@ class Resection:
 
 
 NO_RESECTION = Resection()
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A cut that was made in this session, whether it was undone since or not; attempts count from 1.
+
+    ``state`` is the number of the state right after it.
+    """
+
+    number: int
+    state: int
+    resection: Resection
+
+
+def cut_of(resection: Resection, organ: trimesh.Trimesh, tumour: trimesh.Trimesh | None) -> Cut | None:
+    """The cut of an organ that a resection asks for, at rest; None where it asks for none.
+
+    Raises ResectionError.
+    """
+    request = resection.cut
+    if request is None:
+        return None
+    points = np.zeros((0, 3)) if tumour is None else np.asarray(tumour.vertices)
+    line = score_line(organ, resection.points())
+    return cut_organ(organ, line, request.settings, points[request.seen_of(len(points))])
 
 
 class ScriptedCut(BaseModel):

@@ -37,7 +37,8 @@ from version import VERSION
 
 # A second is a sum of steps: this much less counts as one.
 ROUNDING_S = 1e-6
-NAME = r"session-([0-9]{3,9})\.jsonl"
+# The files of a session, and of a resection whose session is not recorded.
+NAMES = r"(?:session|resection)-([0-9]{3,9})\.(?:jsonl|png|json)"
 
 
 class SessionRecorder:
@@ -161,4 +162,9 @@ def header_of(
 
 def next_path(folder: Path) -> Path:
     """The file of the next session in a folder."""
-    return folder / f"session-{next_number(folder, NAME):03d}.jsonl"
+    return folder / f"session-{next_number(folder, NAMES):03d}.jsonl"
+
+
+def number_of(path: Path) -> int:
+    """The number of a session's file."""
+    return int(path.stem.rpartition("-")[2])

@@ -3,6 +3,7 @@ tissue.
 """
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import click
@@ -73,6 +74,9 @@ class Replay:
             history, _ = history_after(history, number, command)
             if isinstance(command, SetValues):
                 values |= command.values
+        # Files of earlier versions have no state of an attempt.
+        attempts = tuple(state for state in history.attempts if state in log.states)
+        history, kept = replace(history, attempts=attempts), kept | set(attempts)
         number = self._number_at(self.place)
         yield SetValues(values=values)
         yield Load(

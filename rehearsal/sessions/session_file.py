@@ -210,8 +210,10 @@ def history_after(history: History, number: int, command: Recorded | Move) -> tu
     that it restored.
     """
     match command:
-        case BeginAction() | Mark() | CutOut():
+        case BeginAction() | Mark():
             return history.begun(number), None
+        case CutOut():
+            return history.begun(number).attempted(number + 1), None
         case Bookmark():
             return history.marked(number), None
         case Undo():
@@ -310,8 +312,10 @@ def _check_history(name: str, log: Log) -> None:
     """Raises SessionError for a log that restores a state which had not been made."""
     for place, to, history in log.restored():
         command = log.commands[place][1]
-        if isinstance(command, GoTo) and to not in history.bookmarks:
-            raise SessionError(f"{name}: it goes to a bookmark that was not set: its file is damaged")
+        if isinstance(command, GoTo) and to not in history.marked_states:
+            raise SessionError(
+                f"{name}: it goes to a bookmark or an attempt that there was not: its file is damaged"
+            )
     history = History()
     for number, command in log.commands:
         history, restored = history_after(history, number, command)

@@ -152,7 +152,7 @@ class UserSource:
             yield SetValues(values=changed)
 
     def _restores(self, frame: Frame, controls: Controls[LiveSettings]) -> Command | None:
-        """Undo, redo, reset, or the last bookmark, the one before it when asked again."""
+        """Undo, redo, reset, the next attempt, or the last bookmark, the one before it when asked again."""
         if controls.bookmark:
             self._next_bookmark = 0
             return Bookmark()
@@ -168,7 +168,17 @@ class UserSource:
             self._next_bookmark = (self._next_bookmark - 1) % len(frame.bookmarks)
             self._say(f"Bookmark {self._next_bookmark + 1}")
             return GoTo(state=frame.bookmarks[self._next_bookmark])
-        return None
+        return self._next_attempt(frame) if controls.next_attempt else None
+
+    def _next_attempt(self, frame: Frame) -> Command | None:
+        """To the attempt after the present one, the first after the last; without a cut, to the last."""
+        if not frame.attempts:
+            self._say("No attempt yet: {cut_out} cuts along the score")
+            return None
+        present = frame.present_attempt
+        attempt = frame.attempts[-1 if present is None else present.number % len(frame.attempts)]
+        self._say(f"Attempt {attempt.number} of {len(frame.attempts)}")
+        return GoTo(state=attempt.state)
 
     def _operates(self, frame: Frame, controls: Controls[LiveSettings]) -> Iterator[Command]:
         """Marks of the score, or a cut, as the user or the script asks for it; say what cannot be done."""
