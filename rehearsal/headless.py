@@ -17,6 +17,7 @@ from rehearsal.loop.protocols import Observer, Source
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally, summary
 from rehearsal.notices import Notices
+from rehearsal.page.session_images import SessionImages
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.resection_view import ResectionView, cut_settings
@@ -93,6 +94,7 @@ class HeadlessLoop:
     link: OpenIGTLinkServer | None = None
     warnings: tuple[str, ...] = ()
     """Of the import, which nobody has acknowledged."""
+    images: SessionImages = field(default_factory=SessionImages)
     _persistence: Persistence = field(default_factory=Persistence, init=False)
 
     def run(self, steps: int, out: Path, draws: bool) -> list[str]:
@@ -115,6 +117,7 @@ class HeadlessLoop:
                 observer.observe(frame, probe)
             if pictures is not None and view is not None:
                 send_live(self.link, anatomy, view, probe)
+                self.images.observe(self.measurements.onto(view, self.settings.view), anatomy.cut is not None)
                 pictures.draw(step, view, self.settings.view, self.measurements)
             self.notices.present()
         return [pictures.save()] if pictures is not None else []

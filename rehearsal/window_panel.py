@@ -21,6 +21,7 @@ from rehearsal.live_settings import LiveSettings
 from rehearsal.loop.protocols import Source
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.notices import Notices
+from rehearsal.page.session_images import SessionImages
 from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.resection.resection_view import ResectionView, cut_settings
@@ -66,6 +67,7 @@ class WindowPanel:
         link: OpenIGTLinkServer | None = None,
         warnings: tuple[str, ...] = (),
         folder: Path = Path(),
+        images: SessionImages | None = None,
     ) -> None:
         self.anatomy, self.source, self.measurements = anatomy, source, measurements
         self.announcements, self.resection, self.plans, self.notices = (
@@ -77,6 +79,7 @@ class WindowPanel:
         self.out, self.keys, self.counts, self.link = out, keys, counts, link
         self.warnings, self.folder = warnings, folder
         self.sweeping = SweepRecorder(anatomy, notices)
+        self.images = images or SessionImages()
         self.cine, self.caliper = Cine(), Caliper()
         self._frozen = False
         self._notice, self._notice_until = "", 0.0
@@ -123,6 +126,8 @@ class WindowPanel:
             self.sweeping.toggle(self.out)
         shown = self.cine.shown if self.shows_earlier else self._measured(view, probe, settings)
         view = shown.view if self.shows_earlier else self.with_resection(shown.view, settings)
+        if not self.shows_earlier:
+            self.images.observe(view, self.anatomy.cut is not None)
         self.caliper.point(controls.pointed_mm, view.transducer_pose)
         if not self._frozen:
             self.caliper.go_with(view.transducer_pose)
@@ -230,6 +235,7 @@ class WindowPanel:
             whole = image_view(self.anatomy, settings)
             view = replace(view, images=whole.images, doppler=whole.doppler)
         begin, missing = save_view(view, settings.probe, self.out), []
+        self.images.export(begin.rstrip("-"), view)
         if view.notes.keys() & view.images.keys():
             missing.append("B-mode image black: the probe does not touch the organ")
         if self.shows_earlier:

@@ -10,6 +10,7 @@ import numpy as np
 import SimpleITK as sitk
 import trimesh
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.patheffects import withStroke
 from matplotlib.typing import ColorType
 
@@ -91,9 +92,9 @@ def draw_slice(
         picture, cmap="gray", vmin=black, vmax=black + WINDOW_HU, extent=extent, interpolation="bilinear"
     )
     for name, surface in surfaces.items():
-        section = surface.section(np.cross(right, down), middle)
-        for line in [] if section is None else section.discrete:
-            axes.plot(line @ right, line @ down, color=colours[name], linewidth=1.4)
+        lines = trimesh.intersections.mesh_plane(surface, np.cross(right, down), middle)
+        seen = lines @ np.column_stack([right, down])
+        axes.add_collection(LineCollection(seen, colors=[colours[name]], linewidths=1.4, capstyle="round"))
     axes.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[])
     axes.set_title(f"{view.name}, {view.position(middle)}", color="white", fontsize=11)
     draw_scale_bar(axes, extent)

@@ -37,7 +37,8 @@ from version import VERSION
 
 # A second is a sum of steps: this much less counts as one.
 ROUNDING_S = 1e-6
-NAME = r"session-([0-9]{3,9})\.jsonl"
+# A session has the number of its page, which must not replace that of a session which is gone.
+NAME = r"(?:session|report)-([0-9]{3,9})\.(?:jsonl|html)"
 
 
 class SessionRecorder:
