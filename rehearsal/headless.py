@@ -117,7 +117,7 @@ class HeadlessLoop:
                 observer.observe(frame, probe)
             if pictures is not None and view is not None:
                 send_live(self.link, anatomy, view, probe)
-                self.images.observe(self.measurements.onto(view, self.settings.view), anatomy.cut is not None)
+                self.images.observe(self.measurements.onto(view, self.settings.view), anatomy)
                 pictures.draw(step, view, self.settings.view, self.measurements)
             self.notices.present()
         return [pictures.save()] if pictures is not None else []

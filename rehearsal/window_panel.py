@@ -127,7 +127,7 @@ class WindowPanel:
         shown = self.cine.shown if self.shows_earlier else self._measured(view, probe, settings)
         view = shown.view if self.shows_earlier else self.with_resection(shown.view, settings)
         if not self.shows_earlier:
-            self.images.observe(view, self.anatomy.cut is not None)
+            self.images.observe(view, self.anatomy)
         self.caliper.point(controls.pointed_mm, view.transducer_pose)
         if not self._frozen:
             self.caliper.go_with(view.transducer_pose)

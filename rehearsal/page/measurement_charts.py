@@ -14,6 +14,8 @@ LEFT, RIGHT, TOP, BOTTOM = 34, 12, 20, 18
 # Steps between the numbers of an axis, times a power of ten.
 STEPS = (1.0, 2.0, 5.0, 10.0)
 MOST_TICKS = 4
+# Less than this [mm or N] would fill a chart with what is next to nothing.
+LEAST_SCALE = 1.0
 # A session of an hour has more measurements than a chart has pixels.
 MOST_POINTS = 1500
 
@@ -81,7 +83,7 @@ def charts(course: MeasurementCourse, compression_limit_mm: float) -> list[str]:
 def chart(quantity: Quantity, course: MeasurementCourse, limit: float | None = None) -> str:
     """The chart of one quantity, from 0 on, as SVG."""
     values = course.values[quantity.name]
-    y_ticks = ticks(max(float(np.nanmax(values)), 1e-3))
+    y_ticks = ticks(max(float(np.nanmax(values)), LEAST_SCALE))
     y_most, x_most = y_ticks[-1], max(float(course.time_s[-1]), 1e-3)
     x_ticks = [time_s for time_s in ticks(x_most) if time_s <= x_most]
 
@@ -101,6 +103,7 @@ def chart(quantity: Quantity, course: MeasurementCourse, limit: float | None = N
     if limit is not None and limit <= y_most:
         x, y = place(0.0, limit)
         parts.append(f'<path class="limit" d="M{x:.1f} {y:.1f}H{WIDTH - RIGHT}"/>')
+        parts.append(f'<text class="limit" x="{x + 4:.1f}" y="{y + 10:.1f}">limit</text>')
     for time_s in course.cuts_s:
         x, _ = place(time_s, 0.0)
         parts.append(f'<path class="cut" d="M{x:.1f} {TOP}V{HEIGHT - BOTTOM}"/>')

@@ -22,6 +22,7 @@ from rehearsal.page.rest_model import (
     ModelPart,
     glb,
     model_parts,
+    printable,
     score_of,
 )
 from rehearsal.page.session_images import SessionImages
@@ -75,7 +76,7 @@ def save_page_files(
     for name, part in PRINTED.items():
         if part in parts:
             written.append(session.with_name(f"{name}-{number}.stl"))
-            save_surface(parts[part].surface, written[-1])
+            save_surface(printable(parts[part].surface), written[-1])
     return written
 
 

@@ -29,11 +29,15 @@ COLOUR = {
     SPECIMEN: "#d9aaa0",
     TUMOUR_OF_SPECIMEN: "#e8c34a",
 }
+# Where a tumour protrudes, the kidney's surface is the tumour's, within the error of both.
+OVER_TUMOUR_MM = 0.8
 # A resection surface where there is no tumour to measure a margin from.
 NO_MARGIN = "#8f4a45"
 SCORE_RADIUS_MM, SCORE_SIDES = 0.7, 8
 # Of what a cut leaves of the tumour in the specimen, less is rounding [mm^3].
 LEAST_TUMOUR_MM3 = 1.0
+# Vertices of a printed surface that are nearer are one.
+MERGED_MM = 0.001
 # glTF has x to the patient's left, y to the head, z to the front, in m.
 GLTF_FROM_LPS = np.array(
     [[0.001, 0, 0, 0], [0, 0, 0.001, 0], [0, -0.001, 0, 0], [0, 0, 0, 1]],
@@ -65,16 +69,16 @@ def model_parts(anatomy: DeformedAnatomy) -> dict[str, ModelPart]:
     the specimen and the tumour in it. Raises PatientError.
     """
     case, cut, tumour = anatomy.case, anatomy.cut, anatomy.tumour
-    parts = {KIDNEY: ModelPart.plain(case.organ, KIDNEY)}
-    if cut is not None:
-        parts[KIDNEY] = _cut_part(KIDNEY, cut.remnant, cut.on_remnant, case.tumour)
+    whole = case.organ, np.zeros(len(case.organ.faces), bool)
+    remnant = whole if cut is None else (cut.remnant, cut.on_remnant)
+    parts = {KIDNEY: _organ_part(KIDNEY, *remnant, case.tumour)}
     if tumour is not None:
         parts[TUMOUR] = ModelPart.plain(tumour, TUMOUR)
     line = score_of(anatomy)
     if line is not None:
         parts[SCORE] = ModelPart.plain(tube(line.points, SCORE_RADIUS_MM), SCORE)
     if cut is not None:
-        parts[SPECIMEN] = _cut_part(SPECIMEN, cut.specimen, cut.on_specimen, case.tumour)
+        parts[SPECIMEN] = _organ_part(SPECIMEN, cut.specimen, cut.on_specimen, case.tumour)
         removed = None if case.tumour is None else _tumour_removed(case.tumour, cut)
         if removed is not None:
             parts[TUMOUR_OF_SPECIMEN] = ModelPart.plain(removed, TUMOUR_OF_SPECIMEN)
@@ -96,16 +100,17 @@ def score_of(anatomy: DeformedAnatomy) -> ScoreLine | None:
     return None
 
 
-def _cut_part(
+def _organ_part(
     name: str, surface: trimesh.Trimesh, is_cut: np.ndarray, tumour: trimesh.Trimesh | None
 ) -> ModelPart:
-    """A surface whose resection surface has the colours of the margin."""
-    part = ModelPart.plain(surface, name)
-    of_cut = np.tile(to_rgb(NO_MARGIN), (int(is_cut.sum()), 1))
+    """A surface in the colours of the margin on its resection surface, and of the tumour on its capsule."""
+    colours = ModelPart.plain(surface, name).colours
+    colours[is_cut] = to_rgb(NO_MARGIN)
     if tumour is not None:
-        of_cut = margin_colours(signed_distance_from(tumour, surface.triangles_center[is_cut]))
-    part.colours[is_cut] = of_cut
-    return ModelPart(surface, part.colours, is_cut)
+        away = signed_distance_from(tumour, surface.triangles_center)
+        colours[~is_cut & (away < OVER_TUMOUR_MM)] = to_rgb(COLOUR[TUMOUR])
+        colours[is_cut] = margin_colours(away[is_cut])
+    return ModelPart(surface, colours, is_cut)
 
 
 def _tumour_removed(tumour: trimesh.Trimesh, cut: Cut) -> trimesh.Trimesh | None:
@@ -122,6 +127,17 @@ def tube(points: np.ndarray, radius_mm: float) -> trimesh.Trimesh:
         for start, end in zip(points, np.roll(points, -1, axis=0), strict=True)
     ]
     return surface_of(manifold3d.Manifold.batch_boolean(pieces, manifold3d.OpType.Add))[0]
+
+
+def printable(surface: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A closed surface [mm] without the flat triangles that a cut leaves where its edges meet: programs for
+    printing would find it open there.
+    """
+    vertices = np.asarray(surface.vertices)
+    _, first, index = np.unique(np.rint(vertices / MERGED_MM), axis=0, return_index=True, return_inverse=True)
+    faces = index.ravel()[np.asarray(surface.faces)]
+    has_area = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    return trimesh.Trimesh(vertices[first], faces[has_area], process=False)
 
 
 def glb(parts: Mapping[str, ModelPart], translucent: Collection[str] = ()) -> bytes:

@@ -1,10 +1,14 @@
 """The images of a session that its page shows: those that the user exported, or the last ones."""
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 from PIL import Image
 
+from rehearsal.deformed_anatomy import DeformedAnatomy
+from rehearsal.loop.timeline import periods
+from rehearsal.measurements.live_measurements import MEASURE_S
 from render.ultrasound_panel import OUTLINE, RESECTION_LINE, draw_segments
 from render.viewer import View
 from render.window_layout import Rect
@@ -24,16 +28,22 @@ class SessionImages:
     def __init__(self) -> None:
         self._exported: deque[tuple[str, View]] = deque(maxlen=MOST_EXPORTED)
         self._last: dict[bool, View] = {}
+        # The period and whether there was a cut.
+        self._at: tuple[int, bool] | None = None
 
     def export(self, name: str, view: View) -> None:
         """Keep an exported view, by the name of its files."""
         if B_MODE in view.images:
             self._exported.append((f"exported {name}", view))
 
-    def observe(self, view: View, has_cut: bool) -> None:
-        """Keep a view if it shows tissue, before or after a cut."""
-        if B_MODE in view.images and B_MODE not in view.notes:
-            self._last[has_cut] = view
+    def observe(self, view: View, anatomy: DeformedAnatomy) -> None:
+        """Keep the view of an anatomy, with the outline of its tumour, if it shows tissue: four times a
+        second, and at once after a cut.
+        """
+        due = periods(anatomy.frame.time_s, MEASURE_S), anatomy.cut is not None
+        if due != self._at and B_MODE in view.images and B_MODE not in view.notes:
+            self._at = due
+            self._last[due[1]] = replace(view, outline_mm=anatomy.tumour_outline())
 
     def captioned(self, has_cut: bool) -> list[tuple[str, Image.Image]]:
         """The images to show, each with its caption; ``has_cut``: at the end of the session."""
