@@ -71,7 +71,9 @@ def draw_model(parts: Mapping[str, ModelPart], eye: np.ndarray) -> bytes:
         seen = view_axes(towards)
         axes = figure.add_axes((0.5 * place, 0.08, 0.5, 0.82), projection="3d")
         faces = np.concatenate([part.surface.triangles for part in shown.values()])
-        draw_faces(axes, faces @ seen.T, _colours(shown, SPECIMEN in parts), title)
+        placed = faces @ seen.T
+        extent_mm = np.ptp(placed.reshape(-1, 3), axis=0)[:2].max()
+        draw_faces(axes, placed, _colours(shown, SPECIMEN in parts), f"{title}, {extent_mm:.0f} mm")
         draw_compass(figure.add_axes((0.01 + 0.5 * place, 0.1, 0.08, 0.17)), seen)
     return png(figure)
 

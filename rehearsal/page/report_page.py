@@ -94,7 +94,7 @@ class ReportPage:
         if self.tumour:
             yield _section("Complexity of the tumour", table([], self.tumour))
         if self.session:
-            yield _section("Session", table([], self.session))
+            yield _section("Session", f'<div class="short">{table([], self.session)}</div>')
 
     def _second(self) -> Iterable[str]:
         """The second A4 page."""

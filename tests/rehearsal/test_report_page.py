@@ -34,6 +34,7 @@ from rehearsal.page.measurement_charts import (
     ticks,
 )
 from rehearsal.page.page_files import ASIDE_DEG, aside, save_page_files
+from rehearsal.page.page_pictures import image_png
 from rehearsal.page.report_page import (
     DEFAULT_TITLE,
     NOT_MODELLED,
@@ -104,6 +105,10 @@ def view_of(image: np.ndarray, **changed) -> View:
 def page_of(**changed) -> ReportPage:
     values = dict(title="", model=b"glTF", view=ModelView((0.0, -1.0, 0.0), {}), still=b"png")
     return ReportPage(**(values | changed))
+
+
+def picture_of(width: int, height: int) -> bytes:
+    return image_png(Image.new("RGB", (width, height), "gray"))
 
 
 def text_between(page: str, start: str, end: str) -> str:
@@ -439,8 +444,37 @@ def test_an_error_on_the_page_is_noticed(resected, tmp_path):
     assert len(console) == 1
 
 
+def printed_pages(page: Path, folder: Path) -> int:
+    """The number of pages in print."""
+    pdf = folder / "page.pdf"
+    assert browsed(page, folder, f"--print-to-pdf={pdf}", "--no-pdf-header-footer") == []
+    return len(re.findall(rb"/Type\s*/Page\b", pdf.read_bytes()))
+
+
 @needs_browser
-def test_it_prints_on_two_pages(resected, tmp_path):
-    pdf = tmp_path / "page.pdf"
-    console = browsed(resected.written[0], tmp_path, f"--print-to-pdf={pdf}", "--no-pdf-header-footer")
-    assert console == [] and len(re.findall(rb"/Type\s*/Page\b", pdf.read_bytes())) == 2
+def test_it_prints_on_two_pages_however_much_there_is(resected, tmp_path):
+    assert printed_pages(resected.written[0], tmp_path) == 2
+    vessels = [dict(tissue="artery", diameter_mm=3.0)] * 4
+    less = dict(margin_min_mm=0.2, score_to_tumour_mm=2.5, tumour_seen_percent=53.0, vessels=vessels)
+    attempts = [resected.figures | less] * 3
+    words = "text that is as long as what an import says when it is not certain of a side and names a place, "
+    rows = [("size", words), ("distance", words), ("R.E.N.A.L.", words), ("PADUA", 2 * words)]
+    rows += [("estimated", words), ("not known", 2 * words)]
+    values = {each.name: np.arange(9.0) for each in QUANTITIES}
+    full = page_of(
+        title=TITLE,
+        model=model_in(resected.page),
+        still=picture_of(990, 450),
+        ct=picture_of(1210, 470),
+        images=[(words, picture_of(480, 640))] * 4,
+        attempts=attempts,
+        tumour=rows,
+        session=[("duration", "10 s"), ("probe", "one"), ("compression", "1 mm"), ("volume seen", "all")],
+        charts=charts(MeasurementCourse(np.arange(9.0), values, [3.0]), 8.0),
+        warnings=[2 * words] * 3,
+    )
+    (tmp_path / "full.html").write_text(full.html(), "utf-8")
+    assert printed_pages(tmp_path / "full.html", tmp_path) == 2
+    more = page_of(model=model_in(resected.page), tumour=20 * rows)
+    (tmp_path / "more.html").write_text(more.html(), "utf-8")
+    assert printed_pages(tmp_path / "more.html", tmp_path) > 2
