@@ -401,6 +401,7 @@ class Recording:
                 f"({error.strerror})"
             )
         run.measurements.note = self._note
+        run.images.clear()
 
     def _note(self, number: int, reading: dict[str, Any]) -> None:
         if self.recorder is not None:

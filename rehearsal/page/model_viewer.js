@@ -173,12 +173,15 @@
     return [span, axis];
   });
 
+  // Of letters that would be over each other the nearest is shown.
   function placeLetters(right, up, eye) {
-    for (const [span, axis] of letters) {
-      span.style.left = `${52 + 34 * dot(axis, right)}px`;
-      span.style.top = `${canvas.clientHeight - 50 - 34 * dot(axis, up)}px`;
-      // A letter of an axis along the view would be over another one.
-      span.hidden = Math.abs(dot(axis, eye)) > 0.9;
+    const shown = [];
+    for (const [span, axis] of letters.sort((a, b) => dot(b[1], eye) - dot(a[1], eye))) {
+      const x = 52 + 34 * dot(axis, right), y = canvas.clientHeight - 50 - 34 * dot(axis, up);
+      span.hidden = shown.some(([a, b]) => Math.hypot(a - x, b - y) < 16);
+      shown.push([x, y]);
+      span.style.left = `${x}px`;
+      span.style.top = `${y}px`;
       span.style.color = dot(axis, eye) >= 0 ? "#16191d" : "#a9b1b9";
     }
   }

@@ -26,6 +26,10 @@ class SessionImages:
     """
 
     def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin another session."""
         self._exported: deque[tuple[str, View]] = deque(maxlen=MOST_EXPORTED)
         self._last: dict[bool, View] = {}
         # The period and whether there was a cut.

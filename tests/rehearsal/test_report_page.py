@@ -18,12 +18,14 @@ from conftest import ROOT
 from cut_ball import R, ball, circle, cut_by
 from matplotlib.colors import to_rgb
 from PIL import Image
-from recorded_session import record_all
+from recorded_session import header, record_all
 
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.input_files import read_files
 from rehearsal.loop.command import CutOut, Mark, Move, Undo
 from rehearsal.measurements.live_measurements import LiveMeasurements
+from rehearsal.measurements.session_summary import SessionCourse
+from rehearsal.notices import Notices
 from rehearsal.page.measurement_charts import (
     HEIGHT,
     LEFT,
@@ -61,10 +63,12 @@ from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.operation import cut_command
 from rehearsal.resection.proposal import line_around
 from rehearsal.resection.resection_page import COLOURS, report_of, rows_of
-from rehearsal.sessions.recorder import next_path
+from rehearsal.sessions.recorder import SessionRecorder, next_path
 from rehearsal.sessions.session_file import Header, Log
 from render.viewer import View
-from scenes.scene import EMBEDDED
+from scenes.anatomy import LoadedAnatomy
+from scenes.scene import EMBEDDED, Scene
+from ultrasound.probe import load_probe
 from ultrasound.scanner import B_MODE
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -236,7 +240,8 @@ def test_printed_surfaces_are_closed_and_have_the_volumes_of_the_cut(resected):
 
 
 def fake_anatomy(cut=None, tumour=None, marks=()) -> SimpleNamespace:
-    case = SimpleNamespace(organ=ball(R), tumour=tumour, origin=np.array([10.0, -20.0, 30.0]))
+    about = dict(scene=Scene(anatomy={}), probe=load_probe("linear"))
+    case = SimpleNamespace(organ=ball(R), tumour=tumour, origin=np.array([10.0, -20.0, 30.0]), **about)
     resection = SimpleNamespace(points=lambda: np.array(marks).reshape(-1, 3))
     left = None if cut is not None else tumour
     return SimpleNamespace(case=case, cut=cut, tumour=left, frame=SimpleNamespace(resection=resection))
@@ -272,6 +277,18 @@ def test_a_kidney_that_is_not_cut_shows_the_tumour_in_it():
         kidney = next(mesh for mesh in tree["meshes"] if mesh["name"] == KIDNEY)["primitives"][0]
         opacity.append(tree["materials"][kidney["material"]]["pbrMetallicRoughness"]["baseColorFactor"][3])
     assert opacity[0] == 1.0 and 0.2 < opacity[1] < 0.8
+
+
+def test_an_organ_without_tumour_ct_or_a_step_has_a_page(tmp_path):
+    anatomy, session = fake_anatomy(), tmp_path / "session-012.jsonl"
+    loaded = LoadedAnatomy(organ=ball(R), tumour=None, ct=None, shapes=())
+    SessionRecorder(session, header(), Notices()).close({})
+    summary = SessionCourse(8.0).summary({}, [], 0)
+    written = save_page_files(anatomy, loaded, session, summary, SessionImages(), [], [])
+    assert [path.name for path in written] == ["report-012.html", "kidney-012.glb", "kidney-012.stl"]
+    page = written[0].read_text("utf-8")
+    assert f"<h1>{DEFAULT_TITLE}</h1>" in page
+    assert re.findall(r"<h2>(.*?)</h2>", page) == ["Kidney", "Session", "Not modelled"]
 
 
 def test_the_score_is_a_tube_around_the_line():
@@ -323,6 +340,8 @@ def test_images_are_those_exported_or_the_last_before_and_after_the_cut():
     for number in range(6):
         images.export(f"{number:03d}", view_of(black + 10 + number))
     assert [np.asarray(image).max() for _, image in images.captioned(has_cut=True)] == [12, 13, 14, 15]
+    images.clear()
+    assert images.captioned(has_cut=True) == []
 
 
 def test_an_image_has_square_pixels_and_its_lines_in_their_place():
