@@ -18,6 +18,7 @@ from rehearsal.loop.protocols import Observer, Source
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally, summary
 from rehearsal.notices import Notices
+from rehearsal.page.session_images import SessionImages
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.resection_view import ResectionView, cut_settings
@@ -94,6 +95,7 @@ class HeadlessLoop:
     link: OpenIGTLinkServer | None = None
     warnings: tuple[str, ...] = ()
     """Of the import, which nobody has acknowledged."""
+    images: SessionImages = field(default_factory=SessionImages)
     _persistence: Persistence = field(default_factory=Persistence, init=False)
 
     def run(self, steps: int, out: Path, draws: bool) -> list[str]:
@@ -119,6 +121,7 @@ class HeadlessLoop:
                 # What was cut is judged.
                 phase = "Inspect" if anatomy.cut is not None else self.settings.view.phase
                 shown = self.settings.view.model_copy(update=dict(phase=phase))
+                self.images.observe(self.measurements.onto(view, shown), anatomy)
                 pictures.draw(step, view, shown, self.measurements)
             self.notices.present()
         return [pictures.save()] if pictures is not None else []

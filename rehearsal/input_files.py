@@ -76,6 +76,8 @@ def read_files(options: RehearseOptions) -> InputFiles:
         plan = read_plan(options.plan)
     log = session_of(options.replay, options.at) if options.replay else None
     changed, probe = as_asked(scene, options) if log is None else as_recorded(log, scene)
+    if options.title is not None:
+        changed = changed.model_copy(update={"title": options.title})
     bands = None if scene.uncertainty is None else read_bands(path.parent / scene.uncertainty)
     of_import = [find(scene, path.parent) for find in (open_warnings, acknowledged_warnings)]
     return InputFiles(path.parent, changed, probe, keys, track, plan, resection_plan, log, bands, *of_import)

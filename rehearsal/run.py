@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -11,6 +12,7 @@ import click
 import numpy as np
 from click.exceptions import Exit
 
+from errors import UserError
 from rehearsal.announcements import Announcements
 from rehearsal.commands.command_line import STOPPED, CommandError
 from rehearsal.commands.rehearse_options import RehearseOptions
@@ -25,6 +27,7 @@ from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally
 from rehearsal.measurements.session_summary import summary_text
 from rehearsal.notices import Notices
+from rehearsal.page.session_images import SessionImages
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.quit_check import QuitCheck
@@ -101,6 +104,7 @@ class RehearsalRun:
         self.measurements = LiveMeasurements(self.anatomy, self.manipulator, guide, self.files.bands)
         self.resection = ResectionView(self.anatomy, self.files.resection_plan)
         self.attempts = AttemptFigureList(self.anatomy, self.files.resection_plan)
+        self.images = SessionImages()
 
     def in_window(self, prepare: Callable[[WindowLoop], None] = lambda loop: None) -> None:
         """Run in the window, after a replay if there is one; ``prepare`` is called with its loop before the
@@ -136,6 +140,7 @@ class RehearsalRun:
             self.files.folder,
             self.attempts,
             QuitCheck(self.notices, self._acted_at),
+            self.images,
         )
         loop = WindowLoop(
             viewer, self.built.stepper, source, self.anatomy, self.measurements, observers, panel
@@ -179,6 +184,7 @@ class RehearsalRun:
             self.resection,
             self.link,
             self.files.warnings,
+            self.images,
         )
         with self._summarised(check):
             draws, about = not self.options.no_pictures, self._about_patient()
@@ -299,6 +305,28 @@ class RehearsalRun:
         except OSError as error:
             click.echo(f"Warning: the page of the resection is not saved: {error.strerror}")
 
+    def _save_report(self, session: Path, summary: dict[str, Any], attempts: list[dict[str, Any]]) -> None:
+        """Write the page of a recorded session for colleagues."""
+        # With Matplotlib.
+        from rehearsal.page.page_files import save_page_files
+
+        about = summary, self.images, attempts, self._open_warnings()
+        try:
+            written = save_page_files(self.anatomy, self.loaded, session, *about)
+        except (OSError, UserError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            click.echo(f"Warning: the page of the session is not saved: {reason}")
+        else:
+            others = ", ".join(path.name for path in written[1:])
+            click.echo(f"Saved {written[0]} to open, print or send; for 3D programs and printers: {others}")
+
+    def _open_warnings(self) -> tuple[str, ...]:
+        """Those of the import that nobody has acknowledged by now."""
+        # Damaged since the start: the session must still end in order.
+        with suppress(SceneError):
+            return open_warnings(self.files.scene, self.files.folder)
+        return self.files.warnings
+
     def _resection_report(self) -> dict[str, Any] | None:
         """The figures of the resection; None without any."""
         if self.anatomy.judgement is None:
@@ -306,11 +334,8 @@ class RehearsalRun:
         # Matplotlib takes half a second to import.
         from rehearsal.resection.resection_page import report_of
 
-        warnings = self.files.warnings
-        # Damaged since the start: the session must still end in order.
-        with suppress(SceneError):
-            warnings = open_warnings(self.files.scene, self.files.folder)
-        return report_of(self.anatomy, self.files.resection_plan) | dict(import_warnings=list(warnings))
+        figures = report_of(self.anatomy, self.files.resection_plan)
+        return figures | dict(import_warnings=list(self._open_warnings()))
 
     def _end(self) -> None:
         bookmarks = len(self.anatomy.frame.bookmarks)
@@ -332,6 +357,8 @@ class RehearsalRun:
             path = next_path(self.options.out) if recorder is None else recorder.path
             self._save_page(report, number_of(path))
         if recorder is not None:
+            if not recorder.fault:
+                self._save_report(recorder.path, summary, [] if report is None else [report])
             scene = [] if self.options.scene == EMBEDDED else [self.options.scene]
             again = shell_command("rehearse", *scene, "--replay", recorder.path)
             click.echo(recorder.fault or f"Recorded; replay it with: {again}")
@@ -395,6 +422,7 @@ class Recording:
                 f"({error.strerror})"
             )
         run.measurements.note = self._note
+        run.images.clear()
 
     def _note(self, number: int, reading: dict[str, Any]) -> None:
         if self.recorder is not None:

@@ -21,6 +21,7 @@ from rehearsal.loop.protocols import Source
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.message_log import MessageLog
 from rehearsal.notices import Notices
+from rehearsal.page.session_images import SessionImages
 from rehearsal.phase_hints import hint
 from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.quit_check import QuitCheck
@@ -69,6 +70,7 @@ class WindowPanel:
         folder: Path = Path(),
         attempts: AttemptFigureList | None = None,
         quit_check: QuitCheck | None = None,
+        images: SessionImages | None = None,
     ) -> None:
         self.anatomy, self.source, self.measurements = anatomy, source, measurements
         self.resection, self.plans, self.notices = resection, plans, notices
@@ -78,6 +80,7 @@ class WindowPanel:
         self.quit_check = quit_check or QuitCheck(notices)
         self._shows_attempts = False
         self.sweeping = SweepRecorder(anatomy, notices)
+        self.images = images or SessionImages()
         self.cine, self.caliper, self.messages = Cine(), Caliper(), MessageLog()
         self._frozen = False
 
@@ -126,6 +129,8 @@ class WindowPanel:
             self.sweeping.toggle(self.out)
         shown = self.cine.shown if self.shows_earlier else self._measured(view, probe, settings)
         view = shown.view if self.shows_earlier else self.with_resection(shown.view, settings)
+        if not self.shows_earlier:
+            self.images.observe(view, self.anatomy)
         self.caliper.point(controls.pointed_mm, view.transducer_pose)
         if not self._frozen:
             self.caliper.go_with(view.transducer_pose)
@@ -244,6 +249,7 @@ class WindowPanel:
             whole = image_view(self.anatomy, settings)
             view = replace(view, images=whole.images, doppler=whole.doppler)
         begin, missing = save_view(view, settings.probe, self.out), []
+        self.images.export(begin.rstrip("-"), view)
         if view.notes.keys() & view.images.keys():
             missing.append("B-mode image black: the probe does not touch the organ")
         if self.shows_earlier:

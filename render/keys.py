@@ -53,7 +53,7 @@ KEY_MAP = {
         "score: the marks of the planned line, instead of any others": {"score_planned": "Shift+L"},
         "cut along the score": {"cut_out": "Shift+X"},
         "return to the next attempt, undone or not": {"next_attempt": "Shift+N"},
-        "show or hide the table of attempts": {"show_attempts": "Shift+H"},
+        "show or hide the table of attempts": {"show_attempts": "Shift+A"},
     },
     "Plan": {
         "plan a sweep of the target": {"plan": "Return"},

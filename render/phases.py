@@ -53,7 +53,12 @@ TOOLS: dict[Phase, tuple[dict[str, str], ...]] = {
         {"Technique": "technique", "Margin and depth": "show_resection", "Outline": "outline"},
     ),
     "Inspect": (
-        {"Cut open": "cut", "Translucent": "translucent", "Seen": "show_seen", "Doppler": "doppler"},
+        {
+            "Attempts": "show_attempts",
+            "Next attempt": "next_attempt",
+            "Cut open": "cut",
+            "Translucent": "translucent",
+        },
         {"Undo": "undo", "Redo": "redo", "Save": "export", "Screenshot": "screenshot", "Messages": "log"},
     ),
 }

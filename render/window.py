@@ -174,7 +174,10 @@ class Window(Generic[UserSettings]):
             return
         self._read_cursor()
         self._read_events(controls)
-        pressed = [action for action, key in self.keys.held() if self._window.is_pressed(key)]
+        # With shift a key has another action.
+        has_shift = self._window.is_pressed(ti.ui.SHIFT)
+        held = [] if has_shift else self.keys.held()
+        pressed = [action for action, key in held if self._window.is_pressed(key)]
         for action in {*pressed, self._held_tool} - {""}:
             hold(action, controls, elapsed)
             if action in ZOOM_SENSE:

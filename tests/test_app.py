@@ -95,6 +95,11 @@ def pressed(tmp_path_factory) -> Path:
 def test_a_headless_press_reports_what_it_promises(pressed):
     report = json.loads((pressed / "report.json").read_text())
     assert set(report) >= REPORTED
+    page = (pressed / "report-001.html").read_text("utf-8")
+    assert f"<h1>{report['title']}</h1>" in page and "B-mode, last image" in page
+    assert {path.name for path in pressed.glob("*-001.*")} == {
+        *("session-001.jsonl", "report-001.html", "kidney-001.glb", "kidney-001.stl")
+    }
     assert report["version"] == VERSION
     assert report["finite"] is True and report["arch"] == "cpu" and report["cell_mm"] == 7
     assert report["particles"] == report["nodes"] > report["cells"] > 300

@@ -84,6 +84,8 @@ class RehearseOptions(LinkOptions, QualityOptions, ArchOptions):
     """Your own key map: a TOML file as printed by app.py keys."""
     plan: Path | None = None
     """A sweep to follow, or a resection to compare with: a file of app.py plan."""
+    title: str | None = None
+    """Title of window and report, instead of the scene's."""
     out: Path = Path("out")
     """Folder for images and report; a run without a window replaces those of an earlier one."""
     budget_ms: float | None = Field(None, ge=0.01, le=10_000)

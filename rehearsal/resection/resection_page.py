@@ -99,12 +99,12 @@ def draw_page(
     FigureCanvasAgg(figure)
     figure.text(0.03, 0.93, f"{title}: the specimen, coloured by its margin", fontsize=17, weight="bold")
     faces = np.asarray(cut.specimen.vertices)[np.asarray(cut.specimen.faces)]
-    colours = _colours(drawn_mm(signed_distance_from(tumour, faces.mean(axis=1))), cut)
+    colours = _colours(signed_distance_from(tumour, faces.mean(axis=1)), cut)
     for place, (name, eye, up) in enumerate(VIEWS):
         axes = figure.add_axes((0.01 + 0.3 * place, 0.14, 0.3, 0.76), projection="3d")
         seen = _axes(cut, eye, up)
-        _draw_specimen(axes, faces @ seen.T, colours, name)
-        _draw_compass(figure.add_axes((0.02 + 0.3 * place, 0.12, 0.07, 0.158)), seen)
+        draw_faces(axes, faces @ seen.T, colours, name)
+        draw_compass(figure.add_axes((0.02 + 0.3 * place, 0.12, 0.07, 0.158)), seen)
     lowest = _draw_figures(figure, report)
     _draw_histogram(figure.add_axes((0.67, 0.12, 0.31, min(0.28, lowest - 0.15))), judgement)
     _draw_legend(figure)
@@ -119,22 +119,29 @@ def _axes(cut: Cut, eye: tuple[int, int, int], up: tuple[int, int, int]) -> np.n
 
 def _colours(distance_mm: np.ndarray, cut: Cut) -> np.ndarray:
     """Colours (f, 3) of the specimen's faces: those of the margin, or of the capsule."""
-    of_margin = np.array([to_rgb(colour) for colour in COLOURS])
-    colours = of_margin[np.digitize(distance_mm, [0.0, *MARGIN_LIMITS_MM])]
+    colours = margin_colours(distance_mm)
     colours[~cut.on_specimen] = to_rgb(CAPSULE)
     return colours
 
 
-def _draw_specimen(axes: Any, faces: np.ndarray, colours: np.ndarray, title: str) -> None:
-    """Draw faces (f, 3, 3) in the axes right, up, towards the eye."""
+def margin_colours(distance_mm: np.ndarray) -> np.ndarray:
+    """Colours (n, 3) of a resection surface at distances (n,) [mm] from the tumour, negative inside."""
+    of_margin = np.array([to_rgb(colour) for colour in COLOURS])
+    return of_margin[np.digitize(drawn_mm(distance_mm), [0.0, *MARGIN_LIMITS_MM])]
+
+
+def draw_faces(axes: Any, faces: np.ndarray, colours: np.ndarray, title: str) -> None:
+    """Draw faces (f, 3, 3) in the axes right, up, towards the eye; colours (f, 3), or (f, 4) with opacity."""
     normal = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     bright = 0.72 + 0.28 * np.clip(normal @ (LIGHT / np.linalg.norm(LIGHT)), 0, 1)
     seen = normal[:, 2] > 0
     # Matplotlib's axes are x to the right, z up, and y away from the eye.
     placed = np.stack([faces[..., 0], -faces[..., 2], faces[..., 1]], axis=-1)[seen]
-    shaded = (colours * bright[:, None])[seen]
-    axes.add_collection3d(Poly3DCollection(placed, facecolors=shaded, edgecolors=shaded, linewidths=0.4))
+    shaded = np.column_stack([colours[:, :3] * bright[:, None], colours[:, 3:]])[seen]
+    # Edges of translucent faces would be drawn twice.
+    edges = 0.4 if colours.shape[1] == 3 else 0.0
+    axes.add_collection3d(Poly3DCollection(placed, facecolors=shaded, edgecolors=shaded, linewidths=edges))
     low, high = placed.min(axis=(0, 1)), placed.max(axis=(0, 1))
     half, middle = (high - low).max() / 2, (high + low) / 2
     axes.set(**{f"{name}lim": (m - half, m + half) for name, m in zip("xyz", middle, strict=True)})
@@ -145,7 +152,7 @@ def _draw_specimen(axes: Any, faces: np.ndarray, colours: np.ndarray, title: str
     axes.set_title(title, fontsize=12)
 
 
-def _draw_compass(axes: Axes, seen: np.ndarray) -> None:
+def draw_compass(axes: Axes, seen: np.ndarray) -> None:
     """Draw the patient's axes by their letters, for a view's axes right, up, towards the eye (3, 3); ends
     towards the eye are dark.
     """

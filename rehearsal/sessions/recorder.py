@@ -37,8 +37,9 @@ from version import VERSION
 
 # A second is a sum of steps: this much less counts as one.
 ROUNDING_S = 1e-6
-# The files of a session, and of a resection whose session is not recorded.
-NAMES = r"(?:session|resection)-([0-9]{3,9})\.(?:jsonl|png|json)"
+# The files of a session, and those of a resection or a page whose session is not there: none has its number
+# again.
+NAMES = r"(?:session|resection|report)-([0-9]{3,9})\.(?:jsonl|png|json|html)"
 
 
 class SessionRecorder:

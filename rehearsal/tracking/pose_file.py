@@ -58,7 +58,7 @@ def _possible_name(name: str) -> str:
 
 
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
-Place = tuple[Number, Number, Number]
+Place = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Pose = Annotated[list[Row], Field(min_length=4, max_length=4), AfterValidator(_rigid)]
 
 
@@ -81,7 +81,8 @@ class _FilePose(BaseModel):
         if self.time_s is None or (self.score is None and self.cut is None):
             return None
         cut = None if self.cut is None else self.cut.settings()
-        return ScriptedAction(self.time_s - from_s, self.score, self.margin_mm, cut)
+        score = [(x, y, z) for x, y, z in self.score] if isinstance(self.score, list) else self.score
+        return ScriptedAction(self.time_s - from_s, score, self.margin_mm, cut)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@ the summary.
 """
 
 import textwrap
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,11 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from scipy.spatial.distance import pdist
 from skimage.color import rgb2lab
 
+from scenes.ct_slices import COLOUR, LETTER, VIEWS, SliceView, draw_slice
 from scenes.patient_space import in_words
 from scenes.patients.organ_selection import HILAR
 from scenes.patients.part_surfaces import PARTS, PEDICLE_MM
@@ -26,76 +25,27 @@ from scenes.patients.patient_import import Patient
 from scenes.patients.patient_position import LYING
 from scenes.patients.readers.label_maps import Colour
 from scenes.tumour_complexity import Complexity
-from scenes.volumes.lazy_volume import AIR_HU
 from scenes.volumes.voxel_grid import VoxelGrid
 
 BACKGROUND, WARNING = "#101014", "#ffb000"
-PIXEL_MM = 0.5
-WINDOW_HU, LEVEL_HU = 400.0, 50.0
-COLOUR = {
-    "organ": "#ff8767",
-    "tumour": "#ffe14d",
-    "cyst": "#4dd2ff",
-    "urine": "#bdff85",
-    "sinus": "#d57ec3",
-    "vessel": "#e21b51",
-    "support": "#a090ff",
-}
 WORD = {"organ": "kidney", "urine": "collecting system", "vessel": "vessels"}
 LEAST_BRIGHT = 0.85
 # Of two colours, in CIELAB: well above what side by side lines need.
 LEAST_DIFFERENCE = 20.0
-# Lengths of the scale bar, and its largest share of the image's width: the letter is in the middle.
-BARS_MM, BAR_SHARE = (50.0, 20.0), 0.4
 # Letters in a line of the largest text, its sizes [points], and lines times size that fit above the names of
 # the colours.
 TEXT_WIDTH = 56
 TEXT_POINTS = (8.5, 8.0, 7.5, 7.0, 6.5, 6.0, 5.5, 5.0)
 TEXT_HEIGHT = 188.0
-# White with a black outline, readable on bone and on air.
-LETTER: dict[str, Any] = dict(
-    color="white",
-    weight="bold",
-    ha="center",
-    va="center",
-    path_effects=[withStroke(linewidth=3, foreground="black")],
-)
-BAR: dict[str, Any] = dict(color="white", path_effects=[withStroke(linewidth=5, foreground="black")])
 LIGHT = np.array([-0.4, -0.8, 0.45])  # from the front, the patient's right and above
 # View azimuth [degrees], and the signs of the light's direction.
 AZIMUTH = {"from the front": (-105, np.ones(3)), "from behind": (75, np.array([-1.0, -1.0, 1.0]))}
-# Of the axes of LPS: towards which side their numbers are positive, and negative.
-SIDES = ("LR", "PA", "SI")
 # The overview has a panel where it is this many times as wide as the CT around the organ.
 LEAST_WIDER = 1.2
 DRAFT = "made by region growing from a seed, drawn by nobody: check every outline in check.png"
 
 
-@dataclass(frozen=True)
-class CheckView:
-    """A slice in radiological convention: the image's right and down axes in LPS, and the orientation
-    letters.
-    """
-
-    name: str
-    right: tuple[int, int, int]
-    down: tuple[int, int, int]
-    letters: tuple[str, str, str, str]  # left, right, top, bottom
-
-    def position(self, place: np.ndarray) -> str:
-        """Where the slice through a place (3,) [mm] lies, as viewers of CT write it: ``S 118 mm`` is 118
-        mm towards the head.
-        """
-        axis = int(np.argmax(np.abs(np.cross(self.right, self.down))))
-        return f"{SIDES[axis][int(place[axis] < 0)]} {abs(place[axis]):.0f} mm"
-
-
-VIEWS = (
-    CheckView("axial, from the feet", (1, 0, 0), (0, 1, 0), ("R", "L", "A", "P")),
-    CheckView("coronal, from the front", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I")),
-    CheckView("sagittal, from the left", (0, 1, 0), (0, 0, -1), ("A", "P", "S", "I")),
-)
-OVERVIEW = CheckView("coronal, full width", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I"))
+OVERVIEW = SliceView("coronal, full width", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I"))
 
 
 def summary_rows(patient: Patient, complexity: Complexity | None = None) -> list[tuple[str, str]]:
@@ -154,10 +104,10 @@ def draw_check(patient: Patient, rows: list[tuple[str, str]], folder: Path) -> N
     middle = (patient.tumour or patient.organ).bounds.mean(axis=0)
     around = {"support": patient.support, **surfaces}
     for n, view in enumerate(VIEWS):
-        _draw_slice(figure.add_subplot(grid[0, n]), view, patient.ct, around, middle, colours)
+        draw_slice(figure.add_subplot(grid[0, n]), view, patient.ct, around, middle, colours)
     _draw_surfaces(_solid(figure, grid[1, 0]), "from the front", surfaces, colours)
     if is_wider(patient.overview, patient.ct):
-        _draw_slice(figure.add_subplot(grid[1, 1]), OVERVIEW, patient.overview, surfaces, middle, colours)
+        draw_slice(figure.add_subplot(grid[1, 1]), OVERVIEW, patient.overview, surfaces, middle, colours)
     else:
         _draw_surfaces(_solid(figure, grid[1, 1]), "from behind", surfaces, colours)
     words = figure.add_subplot(grid[1, 2])
@@ -184,56 +134,6 @@ def _bright(colour: Colour) -> Colour:
         return LEAST_BRIGHT, LEAST_BRIGHT, LEAST_BRIGHT
     scale = max(1.0, LEAST_BRIGHT / max(colour))
     return colour[0] * scale, colour[1] * scale, colour[2] * scale
-
-
-def _draw_slice(
-    axes: Axes,
-    view: CheckView,
-    ct: sitk.Image,
-    surfaces: dict[str, trimesh.Trimesh],
-    middle: np.ndarray,
-    colours: dict[str, Colour],
-) -> None:
-    right, down = np.array(view.right, float), np.array(view.down, float)
-    low, high = VoxelGrid.of(ct).bounds()
-    spans = [sorted((low @ axis, high @ axis)) for axis in (right, down)]
-    picture = resample_plane(ct, right, down, spans, middle)
-    black = LEVEL_HU - WINDOW_HU / 2
-    extent = (*spans[0], spans[1][1], spans[1][0])
-    axes.imshow(
-        picture, cmap="gray", vmin=black, vmax=black + WINDOW_HU, extent=extent, interpolation="bilinear"
-    )
-    for name, surface in surfaces.items():
-        section = surface.section(np.cross(right, down), middle)
-        for line in [] if section is None else section.discrete:
-            axes.plot(line @ right, line @ down, color=colours[name], linewidth=1.4)
-    axes.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[])
-    axes.set_title(f"{view.name}, {view.position(middle)}", color="white", fontsize=11)
-    _draw_scale_bar(axes, extent)
-    for letter, place in zip(view.letters, ((0.03, 0.5), (0.97, 0.5), (0.5, 0.97), (0.5, 0.03)), strict=True):
-        axes.text(*place, letter, transform=axes.transAxes, fontsize=17, **LETTER)
-
-
-def _draw_scale_bar(axes: Axes, extent: tuple[float, float, float, float]) -> None:
-    """Draw a line of one of BARS_MM at the lower right."""
-    left, right, bottom, top = extent
-    length = next((mm for mm in BARS_MM if mm <= BAR_SHARE * (right - left)), BARS_MM[-1])
-    end, height = right - 0.05 * (right - left), bottom - 0.05 * (bottom - top)
-    axes.plot([end - length, end], [height, height], solid_capstyle="butt", linewidth=3, **BAR)
-    label = dict(LETTER, va="bottom")
-    axes.text(end - length / 2, height - 0.015 * (bottom - top), f"{length:g} mm", fontsize=9, **label)
-
-
-def resample_plane(
-    image: sitk.Image, right: np.ndarray, down: np.ndarray, spans: list[list[float]], middle: np.ndarray
-) -> np.ndarray:
-    """HU on a plane through ``middle``, over two spans [mm]."""
-    across = np.cross(right, down)
-    origin = right * spans[0][0] + down * spans[1][0] + across * (middle @ across)
-    width, height = (int((high - low) / PIXEL_MM) + 1 for low, high in spans)
-    axes = np.column_stack([right, down, across])
-    plane = VoxelGrid((width, height, 1), np.full(3, PIXEL_MM), origin, axes)
-    return plane.sampled(image, sitk.sitkLinear, AIR_HU)[0]
 
 
 def is_wider(overview: sitk.Image, ct: sitk.Image) -> bool:

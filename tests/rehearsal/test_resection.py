@@ -538,10 +538,20 @@ def test_the_example_script_scores_and_cuts():
     assert all(action.score == "image" for action in track.actions[:-1])
 
 
+def test_a_script_has_marks_at_places(tmp_path: Path):
+    path, places = tmp_path / "track.json", [[1.0, 2.5, -3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.0]]
+    entry = {"time_s": 1.5, "probe_to_patient": np.eye(4).tolist(), "score": places}
+    path.write_text(json.dumps([entry | {"time_s": 0.0, "score": None}, entry]))
+    (action,) = load_timed_poses(path).actions
+    assert action.time_s == 1.5 and np.array_equal(action.score, places)
+
+
 @pytest.mark.parametrize(
     ("entry", "text"),
     [
         ({"score": "picture"}, "score"),
+        ({"score": [[1.0, 2.0]]}, "score"),
+        ({"score": [[1.0, 2.0, "3"]]}, "score"),
         ({"score": []}, "score"),
         ({"cut": {"technique": "saw"}}, "technique"),
         ({"cut": {"depth_mm": -1.0}}, "depth_mm"),

@@ -68,6 +68,7 @@ class FakeAnatomy:
 
     def find_plane(self, probe) -> None: ...
     def rest_grid(self) -> None: ...
+    def tumour_outline(self) -> None: ...
 
 
 class FakeMeasurements:
@@ -568,6 +569,7 @@ def test_ctrl_c_in_a_run_says_so_before_how_it_went(monkeypatch, capsys):
 )
 def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scene, words):
     monkeypatch.setattr(run, "summary_text", lambda summary: "")
+    monkeypatch.setattr(run.RehearsalRun, "_save_report", lambda *given: None)
     each = fake_run(scene=scene)
     recorder = SimpleNamespace(path=Path("a/session-001.jsonl"), fault="")
     each.recording = SimpleNamespace(close=lambda stepper, summary: recorder)

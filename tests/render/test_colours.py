@@ -23,7 +23,8 @@ from render.ultrasound_panel import (
     RESECTION_LINE,
     TEXT,
 )
-from scenes.patients.check_picture import COLOUR, LEAST_DIFFERENCE
+from scenes.ct_slices import COLOUR
+from scenes.patients.check_picture import LEAST_DIFFERENCE
 from ultrasound.doppler import AWAY, TOWARDS
 
 # Machado, Oliveira & Fernandes 2009, severity 1, on linear RGB.

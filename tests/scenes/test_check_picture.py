@@ -12,17 +12,13 @@ from ellipsoid_kidney import HALF_AXES, ball, kidney
 from matplotlib.figure import Figure
 from synthetic_body import LEFT, TUMOUR, body, coarsely, points_of, with_voxels
 
+from scenes.ct_slices import COLOUR, PIXEL_MM, VIEWS, draw_scale_bar, resample_plane
 from scenes.patients.check_picture import (
-    COLOUR,
     OVERVIEW,
-    PIXEL_MM,
-    VIEWS,
-    _draw_scale_bar,
     _draw_surfaces,
     colours_of,
     draw_check,
     is_wider,
-    resample_plane,
     summary_rows,
 )
 from scenes.patients.part_surfaces import PARTS
@@ -160,7 +156,7 @@ def longest_run(row) -> int:
 @pytest.mark.parametrize("extent", [(-30.0, 90.0, 60.0, -20.0), (40.0, 130.0, 200.0, 90.0)])
 def test_the_scale_bar_is_as_long_as_it_says_and_in_the_picture(extent):
     axes = Figure().add_subplot()
-    _draw_scale_bar(axes, extent)
+    draw_scale_bar(axes, extent)
     (bar,), (label,) = axes.lines, axes.texts
     (start, end), (height, _) = bar.get_data()
     assert label.get_text() == f"{end - start:g} mm" and start > (extent[0] + extent[1]) / 2
