@@ -132,7 +132,7 @@ def places(vertices: np.ndarray) -> np.ndarray:
     return np.unique(np.asarray(vertices, np.float32), axis=0)
 
 
-# What it says
+# Content
 
 
 def test_the_page_has_the_figures_of_the_resection(resected):
@@ -476,7 +476,7 @@ def test_it_prints_on_two_pages_however_much_there_is(resected, tmp_path):
     vessels = [dict(tissue="artery", diameter_mm=3.0)] * 4
     less = dict(margin_min_mm=0.2, score_to_tumour_mm=2.5, tumour_seen_percent=53.0, vessels=vessels)
     attempts = [resected.figures | less] * 3
-    words = "text that is as long as what an import says when it is not certain of a side and names a place, "
+    words = "text that is as long as a warning of an import that is not certain of a side and names a place, "
     rows = [("size", words), ("distance", words), ("R.E.N.A.L.", words), ("PADUA", 2 * words)]
     rows += [("estimated", words), ("not known", 2 * words)]
     values = {each.name: np.arange(9.0) for each in QUANTITIES}
