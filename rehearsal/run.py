@@ -50,7 +50,7 @@ from rehearsal.window_loop import WindowLoop
 from rehearsal.window_panel import WindowPanel
 from render.window import Window
 from scenes.anatomy import LoadedAnatomy
-from scenes.import_findings import open_warnings
+from scenes.import_findings import import_remarks, open_warnings
 from scenes.scene import EMBEDDED, SceneError
 from scenes.terminal import shell_command
 from scenes.tumour_complexity import complexity
@@ -310,7 +310,7 @@ class RehearsalRun:
         # With Matplotlib.
         from rehearsal.page.page_files import save_page_files
 
-        about = summary, self.images, attempts, self._open_warnings()
+        about = summary, self.images, attempts, self._import_remarks()
         try:
             written = save_page_files(self.anatomy, self.loaded, session, *about)
         except (OSError, UserError) as error:
@@ -319,6 +319,12 @@ class RehearsalRun:
         else:
             others = ", ".join(path.name for path in written[1:])
             click.echo(f"Saved {written[0]} to open, print or send; for 3D programs and printers: {others}")
+
+    def _import_remarks(self) -> list[str]:
+        """What readers of the page must know of the patient's import."""
+        with suppress(SceneError):
+            return import_remarks(self.files.scene, self.files.folder)
+        return [f"Warning of the import: {text}" for text in self.files.warnings]
 
     def _open_warnings(self) -> tuple[str, ...]:
         """Those of the import that nobody has acknowledged by now."""

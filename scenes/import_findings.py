@@ -19,6 +19,7 @@ from settings import Section
 from text_files import TextError, read_text
 
 FINDINGS_FILE = "import.json"
+DRAFT_REMARK = "Draft segmentation: made by region growing from a seed, drawn by nobody"
 
 
 class ImportWarning(Section):
@@ -124,6 +125,21 @@ def acknowledged_warnings(scene: Scene, folder: Path) -> tuple[str, ...]:
     """
     findings = _findings_of(scene, folder)
     return () if findings is None else findings.acknowledged_warnings
+
+
+def import_remarks(scene: Scene, folder: Path) -> list[str]:
+    """What others who look at a scene must know of its import: that it is a draft, and all warnings.
+
+    Raises SceneError.
+    """
+    findings = _findings_of(scene, folder)
+    if findings is None:
+        return []
+    return [
+        *([DRAFT_REMARK] if findings.draft else []),
+        *(f"Warning of the import, not acknowledged: {text}" for text in findings.open_warnings),
+        *(f"Warning of the import, acknowledged: {text}" for text in findings.acknowledged_warnings),
+    ]
 
 
 def _findings_of(scene: Scene, folder: Path) -> ImportFindings | None:

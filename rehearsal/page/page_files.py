@@ -51,15 +51,15 @@ def save_page_files(
     summary: Mapping[str, Any],
     images: SessionImages,
     attempts: Sequence[dict[str, Any]],
-    warnings: Sequence[str],
+    remarks: Sequence[str],
 ) -> list[Path]:
     """Write the page of a recorded session and its surfaces beside the session's file; return them.
 
-    ``summary`` is the session's, ``attempts`` are the figures of resections, ``warnings`` those of the
-    import. Raises OSError, UserError.
+    ``summary`` is the session's, ``attempts`` are the figures of resections, ``remarks`` those of
+    ``import_remarks``. Raises OSError, UserError.
     """
     parts = model_parts(anatomy)
-    page = page_of(anatomy, loaded, parts, session, summary, images, attempts, warnings)
+    page = page_of(anatomy, loaded, parts, session, summary, images, attempts, remarks)
     number = session.stem.rpartition("-")[2]
     written = [session.with_name(f"report-{number}.html")]
     with atomic_write(written[0]) as partial:
@@ -88,7 +88,7 @@ def page_of(
     summary: Mapping[str, Any],
     images: SessionImages,
     attempts: Sequence[dict[str, Any]],
-    warnings: Sequence[str],
+    remarks: Sequence[str],
 ) -> ReportPage:
     """The page, as ``save_page_files`` writes it. Raises UserError."""
     case, cut = anatomy.case, anatomy.cut
@@ -108,7 +108,7 @@ def page_of(
         tumour=[] if of_tumour is None else of_tumour.rows(),
         session=session_rows(anatomy, summary),
         charts=charts(course, case.scene.transducer.compression_warning_mm),
-        warnings=warnings,
+        remarks=remarks,
     )
 
 

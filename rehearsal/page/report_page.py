@@ -21,7 +21,7 @@ NOT_MODELLED = (
     "A cut is made at once, along the scored line, without instruments, bleeding, suction or suture.",
     "Tissue does not tear, bleed, swell, or become soft without blood.",
     "Clamping has no time: warm ischaemia is not computed.",
-    "The margin is measured in the patient at rest, on your labels: it is as good as the segmentation.",
+    "The margin is measured in the patient at rest: it is as good as the segmentation.",
     "The stiffness of this patient: it is a typical value, and the patient's own is not known.",
     "The picture is computed from the CT. What the CT does not show, the picture cannot show.",
 )
@@ -62,7 +62,7 @@ class ReportPage:
     tumour: Sequence[tuple[str, str]] = ()
     session: Sequence[tuple[str, str]] = ()
     charts: Sequence[str] = ()
-    warnings: Sequence[str] = ()
+    remarks: Sequence[str] = ()
 
     def html(self) -> str:
         """The page."""
@@ -70,7 +70,7 @@ class ReportPage:
             title=escape(self.title or DEFAULT_TITLE),
             version=escape(VERSION),
             style=(FOLDER / "page.css").read_text("utf-8").strip(),
-            warnings=self._warnings(),
+            remarks=self._remarks(),
             still=_base64(self.still),
             legend=margin_legend() if self.attempts else "",
             first="\n".join(self._first()),
@@ -81,10 +81,8 @@ class ReportPage:
             viewer=(FOLDER / "model_viewer.js").read_text("utf-8").strip(),
         )
 
-    def _warnings(self) -> str:
-        lines = "".join(
-            f"<p>Warning of the import, not acknowledged: {escape(text)}</p>" for text in self.warnings
-        )
+    def _remarks(self) -> str:
+        lines = "".join(f"<p>{escape(text)}</p>" for text in self.remarks)
         return f'<div class="warning">{lines}</div>' if lines else ""
 
     def _first(self) -> Iterable[str]:

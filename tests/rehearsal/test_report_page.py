@@ -96,8 +96,8 @@ def resected(one_device, tmp_path_factory):
     images.observe(view_of(np.full((40, 30), 90, np.uint8)), anatomy)
     figures = report_of(anatomy)
     summary = LiveMeasurements(anatomy, rehearsal.manipulator).summary()
-    warnings = ["the side is <not> certain"]
-    written = save_page_files(anatomy, loaded, session, summary, images, [figures], warnings)
+    remarks = ["the side is <not> certain"]
+    written = save_page_files(anatomy, loaded, session, summary, images, [figures], remarks)
     page = written[0].read_text("utf-8")
     return SimpleNamespace(anatomy=anatomy, figures=figures, written=written, page=page)
 
@@ -132,14 +132,14 @@ def places(vertices: np.ndarray) -> np.ndarray:
     return np.unique(np.asarray(vertices, np.float32), axis=0)
 
 
-# What it says
+# Content
 
 
 def test_the_page_has_the_figures_of_the_resection(resected):
     for name, value in rows_of(resected.figures):
         assert f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" in resected.page
     assert "R.E.N.A.L." in resected.page and "PADUA" in resected.page
-    assert "not acknowledged: the side is &lt;not&gt; certain" in resected.page
+    assert "<p>the side is &lt;not&gt; certain</p>" in resected.page
     assert f"<h1>{resected.anatomy.case.scene.title}</h1>" in resected.page
     assert "B-mode, after the cut, 30 x 40 mm" in resected.page
     assert margin_legend() in resected.page
@@ -187,7 +187,7 @@ def test_what_is_not_modelled_is_said_as_in_the_documents():
     limits = " ".join((ROOT / "docs" / "limitations.md").read_text("utf-8").replace("**", "").split())
     for sentence in NOT_MODELLED:
         text = sentence.replace("The picture is", "It is")
-        assert all(part in limits for part in re.split(r"(?<=,) |\. |\.$", text)), sentence
+        assert all(part in limits for part in re.split(r"(?<=,) |[.:] |\.$", text)), sentence
         assert escape(sentence) in page_of().html()
 
 
@@ -476,7 +476,7 @@ def test_it_prints_on_two_pages_however_much_there_is(resected, tmp_path):
     vessels = [dict(tissue="artery", diameter_mm=3.0)] * 4
     less = dict(margin_min_mm=0.2, score_to_tumour_mm=2.5, tumour_seen_percent=53.0, vessels=vessels)
     attempts = [resected.figures | less] * 3
-    words = "text that is as long as what an import says when it is not certain of a side and names a place, "
+    words = "text that is as long as a warning of an import that is not certain of a side and names a place, "
     rows = [("size", words), ("distance", words), ("R.E.N.A.L.", words), ("PADUA", 2 * words)]
     rows += [("estimated", words), ("not known", 2 * words)]
     values = {each.name: np.arange(9.0) for each in QUANTITIES}
@@ -490,7 +490,7 @@ def test_it_prints_on_two_pages_however_much_there_is(resected, tmp_path):
         tumour=rows,
         session=[("duration", "10 s"), ("probe", "one"), ("compression", "1 mm"), ("volume seen", "all")],
         charts=charts(MeasurementCourse(np.arange(9.0), values, [3.0]), 8.0),
-        warnings=[2 * words] * 3,
+        remarks=[2 * words] * 3,
     )
     (tmp_path / "full.html").write_text(full.html(), "utf-8")
     assert printed_pages(tmp_path / "full.html", tmp_path) == 2

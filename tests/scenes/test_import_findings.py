@@ -13,6 +13,7 @@ from app import main
 from scenes.import_findings import (
     acknowledge,
     acknowledged_warnings,
+    import_remarks,
     open_warnings,
     read_findings,
     warning_lines,
@@ -82,6 +83,17 @@ def test_warnings_are_open_until_they_are_acknowledged(folder):
     assert [each.text for each in after.warnings] == list(TEXTS)
     assert after.model_copy(update=dict(warnings=before.warnings)) == before
     assert not list(folder.glob(".*"))
+
+
+def test_others_read_of_all_warnings_and_of_a_draft(folder, tmp_path):
+    acknowledge(folder, TEXTS[:1])
+    start = "Warning of the import,"
+    not_checked = [f"{start} not acknowledged: {text}" for text in TEXTS[1:]]
+    assert import_remarks(files_scene(), folder) == [*not_checked, f"{start} acknowledged: {TEXTS[0]}"]
+    (folder / "import.json").write_text(json.dumps(findings() | dict(draft=True)))
+    assert import_remarks(files_scene(), folder)[0].startswith("Draft segmentation")
+    assert import_remarks(Scene(anatomy=AnatomyFiles(phantom=True)), folder) == []
+    assert import_remarks(files_scene(), tmp_path / "none") == []
 
 
 def test_a_warning_that_was_not_shown_stays_open(folder):
