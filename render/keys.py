@@ -65,11 +65,11 @@ KEY_MAP = {
         "start and stop recording a tracked sweep": {"sweep": "L"},
         "take control from a replay or a tracked probe": {"take_over": "K"},
         "warnings of the import: checked": {"acknowledge": "Shift+I"},
-        "reset tissue, probe, marks and view; undo restores all but the view": {"reset": "R"},
+        "reset tissue, transducer, marks and view": {"reset": "R"},
         "save a screenshot of the window": {"screenshot": "P"},
         "show or hide this list": {"help": "H"},
         "show or hide the messages of the session": {"log": "Shift+H"},
-        "quit, asked once more after something was done": {"quit": "Esc"},
+        "quit; after an action it asks once": {"quit": "Esc"},
     },
 }
 DEFAULT_BUTTONS = {

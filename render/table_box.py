@@ -8,7 +8,7 @@ from PIL import Image, ImageDraw
 
 from render.text import font
 from render.ultrasound_panel import FINDINGS, LINE, MARK, QUIET, TEXT
-from render.viewer import Table
+from render.viewer import TextTable
 from render.window_layout import Rect, WindowLayout
 
 LETTERS_PX, TITLE_PX, LINE_PX, ROW_PX, PAD_PX, GAP_PX = 14, 16, 17, 26, 10, 8
@@ -18,7 +18,7 @@ MARKED = (58, 66, 76)
 EARLIER = "{} earlier ones are not shown"
 
 
-def table_rect(layout: WindowLayout, table: Table | None) -> Rect | None:
+def table_rect(layout: WindowLayout, table: TextTable | None) -> Rect | None:
     """The box of a table, over the top of the 3D view in its whole width; None without one."""
     if table is None:
         return None
@@ -29,7 +29,7 @@ def table_rect(layout: WindowLayout, table: Table | None) -> Rect | None:
 
 
 @lru_cache(maxsize=4)
-def table_image(layout: WindowLayout, table: Table) -> np.ndarray:
+def table_image(layout: WindowLayout, table: TextTable) -> np.ndarray:
     """A table as an image, uint8, shape (height, width, 3) of its box; of more rows than fit, the last."""
     box, px = table_rect(layout, table), layout.px
     if box is None:
@@ -58,29 +58,29 @@ def table_image(layout: WindowLayout, table: Table) -> np.ndarray:
     return np.asarray(image)
 
 
-def _title(layout: WindowLayout, table: Table) -> str:
+def _title(layout: WindowLayout, table: TextTable) -> str:
     hidden = len(table.rows) - _most_rows(layout, table)
     return f"{table.title}; {EARLIER.format(hidden)}" if hidden > 0 else table.title
 
 
-def _headings(table: Table) -> list[list[str]]:
+def _headings(table: TextTable) -> list[list[str]]:
     return [textwrap.wrap(heading, HEADING_LETTERS, break_long_words=False) for heading in table.headings]
 
 
-def _head_height(layout: WindowLayout, table: Table) -> int:
+def _head_height(layout: WindowLayout, table: TextTable) -> int:
     """Title and headings."""
     lines = max(map(len, _headings(table)))
     px = layout.px
     return px(PAD_PX) + px(TITLE_PX) + px(GAP_PX) + lines * px(LINE_PX) + px(GAP_PX)
 
 
-def _most_rows(layout: WindowLayout, table: Table) -> int:
+def _most_rows(layout: WindowLayout, table: TextTable) -> int:
     """How many rows fit above the compass."""
     room = layout.compass.top - layout.scene.top - 3 * layout.px(PAD_PX) - _head_height(layout, table)
     return max(1, room // layout.px(ROW_PX))
 
 
-def _right_edges(layout: WindowLayout, table: Table, width: int) -> list[float]:
+def _right_edges(layout: WindowLayout, table: TextTable, width: int) -> list[float]:
     """Where each column ends: what the texts leave of the width is shared between the columns."""
     letters = font(layout.px(LETTERS_PX))
     widths = [

@@ -141,7 +141,7 @@ class Score:
 
 
 @dataclass(frozen=True)
-class Table:
+class TextTable:
     """A table of texts under headings; ``marked`` is the index of the row that is marked, if one is."""
 
     title: str
@@ -224,7 +224,7 @@ class View:
     """Warnings that nobody has acknowledged, of the import."""
     title: str = ""
     """Scene or case; no identifiers of the patient."""
-    table: Table | None = None
+    table: TextTable | None = None
     """A table over the 3D view, such as of the attempts."""
 
     @property

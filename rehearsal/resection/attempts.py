@@ -14,7 +14,7 @@ from rehearsal.resection.proposal import cost_ml
 from rehearsal.resection.resection_plan import ResectionPlan
 from rehearsal.resection.resection_state import Attempt
 from rehearsal.result_files import counted
-from render.viewer import Table, Technique
+from render.viewer import Technique, TextTable
 from ultrasound.probe import Probe
 
 # A figure that cannot be had.
@@ -85,7 +85,7 @@ class AttemptFigureList:
         """The figures of all attempts, for ``report.json``."""
         return [asdict(figures) for figures in self.figures]
 
-    def table(self) -> Table:
+    def table(self) -> TextTable:
         """All attempts; the present one is marked."""
         present = self._anatomy.frame.present_attempt
         return table_of(self.figures, None if present is None else present.number)
@@ -126,14 +126,14 @@ def figures_of_attempt(
     )
 
 
-def table_of(attempts: Sequence[AttemptFigures], present: int | None = None) -> Table:
+def table_of(attempts: Sequence[AttemptFigures], present: int | None = None) -> TextTable:
     """Attempts as the rows of a table; ``present`` is the number of the one whose cut the tissue has."""
     planned = attempts[0].planned_points if attempts else None
     points = () if planned is None else (f"points (plan {planned:.1f})",)
     numbers = [attempt.number for attempt in attempts]
     marked = numbers.index(present) if present in numbers else None
     title = f"{counted(len(attempts), 'attempt')}" if attempts else "No attempt yet: a cut is one"
-    return Table(title, (*HEADINGS, *points), tuple(attempt.row() for attempt in attempts), marked)
+    return TextTable(title, (*HEADINGS, *points), tuple(attempt.row() for attempt in attempts), marked)
 
 
 def attempts_text(attempts: Sequence[AttemptFigures]) -> str:
