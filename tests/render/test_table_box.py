@@ -13,7 +13,7 @@ from render.window_layout import WindowLayout
 
 HEADINGS = (
     *("attempt", "technique", "margin asked, mm", "least kept, mm", "mean kept, mm"),
-    *("parenchyma removed, ml", "collecting system, mm2", "vessels divided", "points (plan 102.3)"),
+    *("parenchyma removed, ml", "collecting system opened, mm2", "vessels divided", "points (plan 102.3)"),
 )
 ROW = ("12", "enucleoresection", "12.5", "10.2", "11.4", "104.9", "not labelled", "not labelled", "112.8")
 FULL = WindowLayout(1280, 720)
