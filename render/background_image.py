@@ -100,7 +100,7 @@ class BackgroundImage:
         Sliders beside the warnings have ``taken`` so many pixels at the right of the 3D view.
         With ``slow_figures``, figures change only every READOUT_PERIOD_S, so that they can be read.
         """
-        findings = first_of(view.findings, self.layout.most_findings)
+        findings = self._findings_of(view)
         # What the backdrop depends on.
         plane = view.width_mm, view.depth_mm, view.above_mm, view.focus_mm, view.outline_mm is not None
         parts = (
@@ -156,11 +156,15 @@ class BackgroundImage:
 
     def boxes_over_scene(self, view: View) -> list[Rect]:
         """The boxes that cover the 3D view: compass, findings, warnings, table."""
-        count = min(len(view.findings), self.layout.most_findings)
+        count = len(self._findings_of(view))
         findings = self.layout.findings(count) if count else None
         table = table_rect(self.layout, view.table)
         boxes = self.layout.compass, findings, self._warning_rect(view), table
         return [box for box in boxes if box is not None]
+
+    def _findings_of(self, view: View) -> dict[str, str]:
+        """The findings that are shown: none where a table has their place."""
+        return first_of(view.findings, self.layout.most_findings) if view.table is None else {}
 
     def _warning_rect(self, view: View) -> Rect | None:
         return warning_rect(self.layout, view.warnings, self._taken)

@@ -43,8 +43,8 @@ def table_image(layout: WindowLayout, table: TextTable) -> np.ndarray:
     top = _head_height(layout, table)
     for heading, right in zip(_headings(table), rights, strict=True):
         for count, line in enumerate(reversed(heading)):
-            y = top - px(GAP_PX) - count * px(LINE_PX)
-            draw.text((right, y), line, font=letters, fill=QUIET, anchor="rb")
+            y = top - px(GAP_PX) - (count + 0.5) * px(LINE_PX)
+            draw.text((right, y), line, font=letters, fill=QUIET, anchor="rm")
     draw.line([(pad, top - 1), (box.width - pad, top - 1)], fill=LINE)
     for place, row in enumerate(table.rows[first:]):
         y = top + place * px(ROW_PX)

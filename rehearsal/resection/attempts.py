@@ -21,7 +21,7 @@ from ultrasound.probe import Probe
 UNKNOWN = "-"
 HEADINGS = (
     *("attempt", "technique", "margin asked, mm", "least kept, mm", "mean kept, mm"),
-    *("parenchyma removed, ml", "collecting system, mm2", "vessels divided"),
+    *("parenchyma removed, ml", "collecting system opened, mm2", "vessels divided"),
 )
 
 

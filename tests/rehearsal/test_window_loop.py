@@ -362,6 +362,13 @@ def test_warnings_that_cannot_be_acknowledged_stay(tmp_path, monkeypatch, error)
     assert view.messages == (f"Not saved: {getattr(error, 'strerror', None) or error}",)
 
 
+def test_the_table_of_attempts_is_shown_and_hidden_by_its_key(looping):
+    assert looping.next().table is None
+    shown = looping.next(show_attempts=True).table
+    assert shown.rows == () and shown.title.startswith("No attempt yet")
+    assert looping.next().table == shown and looping.next(show_attempts=True).table is None
+
+
 def test_a_frozen_image_keeps_its_caliper_and_a_live_one_until_the_probe_moves(looping):
     looping.source.commands = lambda frame, controls, elapsed_s: []
     place = (1.0, 2.0)

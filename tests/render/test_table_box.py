@@ -1,16 +1,19 @@
 """A table over the 3D view: whole texts of readable size, above the compass, the marked row in its colour."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import ImageDraw
 
+from render.background_image import BackgroundImage
 from render.table_box import LETTERS_PX, MARKED, table_image, table_rect
-from render.viewer import TextTable
+from render.viewer import TextTable, View
 from render.window_layout import WindowLayout
 
 HEADINGS = (
     *("attempt", "technique", "margin asked, mm", "least kept, mm", "mean kept, mm"),
-    *("parenchyma removed, ml", "collecting system, mm2", "vessels divided", "points (plan 102.3)"),
+    *("parenchyma removed, ml", "collecting system opened, mm2", "vessels divided", "points (plan 102.3)"),
 )
 ROW = ("12", "enucleoresection", "12.5", "10.2", "11.4", "104.9", "not labelled", "not labelled", "112.8")
 FULL = WindowLayout(1280, 720)
@@ -53,6 +56,21 @@ def test_the_marked_row_is_marked_and_the_last_rows_are_shown_where_not_all_fit(
     table_image.cache_clear()
     table_image(FULL, table(30))
     assert "29" in written and "0" not in written and written[0].endswith("earlier ones are not shown")
+
+
+def test_the_table_takes_the_place_of_the_findings():
+    page = BackgroundImage(FULL)
+    shown = View(np.eye(4), {"CT": np.zeros((4, 4), np.uint8)}, 40.0, 40.0, findings={"margin": "5 mm"})
+    axes = np.eye(3)
+    page.compose(shown, axes)
+    before = page.pixels.copy()
+    page.compose(replace(shown, table=table(2)), axes)
+    box = table_rect(FULL, table(2))
+    assert page.boxes_over_scene(replace(shown, table=table(2))) == [FULL.compass, box]
+    rows = page.pixels.transpose(1, 0, 2)[::-1, :, :3]
+    assert (rows[box.slices] == table_image(FULL, table(2))).all()
+    page.compose(shown, axes)
+    assert (page.pixels == before).all()
 
 
 def test_without_a_table_there_is_no_box():
