@@ -16,6 +16,7 @@ from sim.penetration_barrier import (
     BARRIER_SPACING_MM,
     BLOCK,
     INSET_CELLS,
+    NEAR_MM,
     RADIUS_MM,
     STIFFNESS_RATIO,
     STRETCH,
@@ -104,6 +105,19 @@ def test_each_point_bears_its_depth_in_the_smaller_tool(kept, tissue):
     borne = 1e-3 * STIFFNESS_RATIO * YOUNG_KPA / PENALTY_DEPTH_MM * (area * depth).sum()
     # At rest up to the 0.01 mm/s of the last step.
     assert barrier.load(solver.tool)[6] == pytest.approx(borne, rel=0.01)
+
+
+def test_all_points_that_are_near_are_found(kept, tissue):
+    """Also those at the border of a block whose middle is not near."""
+    solver = pressed(tissue, PRESSED_MM, True)
+    barrier = solver.contacts.barrier
+    at = array_of(Skin(solver.model.carrier, barrier.whole[0]).vertices).astype(float)
+    outside = -depth_in_tool(at, pose_at(PRESSED_MM), INSET_CELLS * CELL_MM, RADIUS_MM)
+    near = array_of(barrier.near) > 0
+    # At rest they are where they were when they were looked for, up to the last step's motion.
+    still_mm = 0.01
+    assert near[(outside > still_mm - RADIUS_MM) & (outside < NEAR_MM - still_mm)].all()
+    assert not near[outside > NEAR_MM + still_mm].any() and near.sum() > BLOCK
 
 
 def test_points_that_a_tool_leaves_bear_nothing(kept, tissue):
