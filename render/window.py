@@ -103,6 +103,8 @@ class Window(Generic[UserSettings]):
         self._pressing = self._held_shift = False
         # The boxes of the tools by action, and the tool that the mouse holds.
         self._tools: dict[str, Rect] = {}
+        # The layout and the settings that these are of.
+        self._tools_of: tuple[WindowLayout | None, UserSettings | None] = None, None
         self._held_tool = ""
         # The boxes of sliders by group, and how often the user moved each.
         self._slider_boxes: dict[str, Rect] = {}
@@ -359,9 +361,7 @@ class Window(Generic[UserSettings]):
             if self.layout.has_engineer != self.settings.view.show_engineer:
                 self._change_layout(replace(self.layout, has_engineer=self.settings.view.show_engineer))
             self._place_sliders()
-            tools = tools_of(self.layout, self.settings, self.keys)
-            self._tools = {tool.action: tool.box for tool in tools}
-            self._background.put_tools(self.settings.view.phase, tools)
+            self._place_tools()
             self._background.compose(view, np.stack(self.camera.axes()), self._taken(), self._visible)
             keeps = self._is_ahead or self._keeps_scene()
             if self._software is not None and not (keeps and self._background.has_scene):
@@ -373,6 +373,14 @@ class Window(Generic[UserSettings]):
         if not self._page:
             placed = self._slider_boxes, self._first_size, self._boxes_moved
             self.settings = draw_sliders(self._gui, self.settings, self._geometry, *placed)
+
+    def _place_tools(self) -> None:
+        """Have the tools of the present settings and layout."""
+        of = self.layout, self.settings
+        if any(one is not other for one, other in zip(of, self._tools_of, strict=True)):
+            tools = tools_of(self.layout, self.settings, self.keys)
+            self._tools, self._tools_of = {tool.action: tool.box for tool in tools}, of
+            self._background.put_tools(self.settings.view.phase, tools)
 
     def _place_sliders(self) -> None:
         """Have the boxes of the present settings."""
