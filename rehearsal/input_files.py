@@ -59,7 +59,7 @@ def read_files(options: RehearseOptions) -> InputFiles:
     """Read the files that the user names. Raises UserError, CommandError."""
     path = scene_file(options.scene)
     scene = load_scene(path)
-    keys = load_keys(options.keys, DEFAULT_KEYS) if options.keys else DEFAULT_KEYS
+    keys = keys_of(options)
     options.check()
     track = load_track(options.track, options.track_from) if options.track else None
     plan = resection_plan = None
@@ -81,6 +81,11 @@ def read_files(options: RehearseOptions) -> InputFiles:
     bands = None if scene.uncertainty is None else read_bands(path.parent / scene.uncertainty)
     of_import = [find(scene, path.parent) for find in (open_warnings, acknowledged_warnings)]
     return InputFiles(path.parent, changed, probe, keys, track, plan, resection_plan, log, bands, *of_import)
+
+
+def keys_of(options: RehearseOptions) -> Keys:
+    """The keys of the window. Raises KeysError."""
+    return load_keys(options.keys, DEFAULT_KEYS) if options.keys else DEFAULT_KEYS
 
 
 def check_anatomy(files: InputFiles, options: RehearseOptions, anatomy: LoadedAnatomy) -> None:

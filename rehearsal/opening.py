@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING
 
 import click
 import numpy as np
+from click.exceptions import Exit
 
 from rehearsal.case import Case, case_of
 from rehearsal.commands.command_line import CommandError, make_folder, start_taichi
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.configuration import Setup, scene_of
-from rehearsal.input_files import InputFiles, check_anatomy, read_files
+from rehearsal.input_files import InputFiles, check_anatomy, keys_of, read_files
 from rehearsal.real_time.pace import Pace
 from rehearsal.real_time.start_times import StartTimes
 from rehearsal.real_time.started_process import StartedProcess
@@ -45,26 +46,32 @@ def opened(options: RehearseOptions, process: StartedProcess | None) -> Iterator
 
     Raises UserError, CommandError.
     """
-    start = StartTimes()
-    start.begin("Files")
-    files = read_files(options)
-    for warning in warning_lines(files.warnings, files.folder):
-        click.echo(warning)
-    for text in files.acknowledged:
-        click.echo(f"Acknowledged warning of the import: {text}")
+    start, arch, solver, viewer = StartTimes(), "", None, None
     with ExitStack() as resources:
+        if process is not None and options.leaves_patient_open:
+            start.begin("Start screen")
+            solver = resources.enter_context(solver_process(process))
+            check_graphics()
+            arch = start_taichi(options.arch)
+            viewer = resources.enter_context(window(options, keys_of(options)))
+            options = with_choice(options, viewer)
+        start.begin("Files")
+        files = read_files(options)
+        for warning in warning_lines(files.warnings, files.folder):
+            click.echo(warning)
+        for text in files.acknowledged:
+            click.echo(f"Acknowledged warning of the import: {text}")
         start.begin("Taichi")
-        solver = None if process is None else resources.enter_context(solver_process(process))
-        if solver is not None:
+        if process is not None and solver is None:
+            solver = resources.enter_context(solver_process(process))
             check_graphics()
         make_folder(options.out)
-        arch = start_taichi(options.arch)
+        arch = arch or start_taichi(options.arch)
         link = open_link(options)
         start.begin("Window")
         # A budget is met by trials, and each starts Taichi anew, which would end a window.
         has_trials = options.budget_ms is not None or options.error_mm is not None
-        viewer = None
-        if not (options.headless or has_trials):
+        if viewer is None and not (options.headless or has_trials):
             viewer = resources.enter_context(window(options, files.keys))
         with stages() as line:
 
@@ -105,6 +112,21 @@ def opened(options: RehearseOptions, process: StartedProcess | None) -> Iterator
         from rehearsal.run import RehearsalRun
 
         yield RehearsalRun(built, anatomy, arch, options, files, viewer, link, build_s, start)
+
+
+def with_choice(options: RehearseOptions, viewer: "Window[LiveSettings]") -> RehearseOptions:
+    """The options with the patient or session that the user chooses on the start screen.
+
+    Raises Exit where the user quits.
+    """
+    from rehearsal.start_screen.patient_list import PATIENTS_FOLDER
+    from rehearsal.start_screen.patient_page import PatientPage
+    from rehearsal.start_screen.start_page import StartScreen
+
+    choice = StartScreen(viewer, PatientPage(PATIENTS_FOLDER, options.out)).choice()
+    if choice is None:
+        raise Exit
+    return options.model_copy(update=dict(scene=choice.scene, replay=choice.replay, at=choice.at_s))
 
 
 @contextmanager

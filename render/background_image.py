@@ -177,7 +177,11 @@ class BackgroundImage:
 
     def show_progress(self, text: str) -> None:
         """Draw what is being prepared, until the first ``compose``."""
-        self._put(self.layout.whole, progress_image(self.layout, text))
+        self.show_image(progress_image(self.layout, text))
+
+    def show_image(self, image: np.ndarray) -> None:
+        """Draw an image over everything, uint8 (height, width, 3), until the first ``compose``."""
+        self._put(self.layout.whole, image)
 
     def show_page(self, name: str, view: View) -> None:
         """Draw a page (``keys.PAGES``) over everything, until the next ``compose``."""

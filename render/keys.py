@@ -17,6 +17,8 @@ from text_files import TextError, read_toml
 KEYS = {letter: letter.lower() for letter in string.ascii_uppercase}
 KEYS |= {name: name for name in ("Up", "Down", "Left", "Right", "Return")}
 KEYS |= {"Esc": "Escape", "Space": " ", "Backspace": "BackSpace", "Tab": "Tab"}
+# The same the other way: how a key is printed that GGUI names.
+PRINTED = {name: key for key, name in KEYS.items()}
 # With the shift key held; as GGUI names them, after this word.
 WITH_SHIFT = "Shift+"
 KEYS |= {WITH_SHIFT + key: WITH_SHIFT + name for key, name in KEYS.items()}

@@ -235,6 +235,14 @@ class View:
         return self.images | {next(iter(self.images)): self.doppler}
 
 
+@dataclass(frozen=True)
+class KeyOrClick:
+    """A key that went down, as printed, or where the left mouse button went down: column and row [pixels]."""
+
+    key: str = ""
+    place: tuple[float, float] | None = None
+
+
 @dataclass
 class Controls(Generic[UserSettings]):
     """The user's input since the last frame; lengths and angles are changes in that time.

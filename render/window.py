@@ -25,12 +25,12 @@ from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
 from render.display import display_available
 from render.gamepad import Gamepad
 from render.graphics_scene import GraphicsScene
-from render.keys import HELD, PAGES, Keys, begin, default_keys, hold
+from render.keys import HELD, PAGES, PRINTED, Keys, begin, default_keys, hold
 from render.phases import tabs_of, tools_of
 from render.scene_view import SceneView
 from render.sliders import boxes_of, draw_sliders
 from render.software_scene import SoftwareScene
-from render.viewer import Controls, Geometry, UserSettings, View
+from render.viewer import Controls, Geometry, KeyOrClick, UserSettings, View
 from render.vulkan_device import draws_by_processor
 from render.window_layout import FULL_SIZE, Rect, WindowLayout
 from settings import with_values
@@ -38,6 +38,8 @@ from sim.device import on_cpu
 from sim.taichi_internals import set_image
 
 ZOOM_S = 0.5
+# A window that is lower or narrower, such as one that is hidden, keeps its layout [pixels].
+LEAST_PX = 200
 # How far beside a box of sliders the mouse still takes its edge [pixels], and how far it goes in a drag, in
 # shares of the window.
 BOX_EDGE_PX, DRAG = 4, 0.002
@@ -152,6 +154,32 @@ class Window(Generic[UserSettings]):
             self._background.show_progress(text)
             self._put_image()
             self._window.show()
+
+    # Before a scene is shown
+
+    def show_image(self, image: np.ndarray) -> None:
+        """Show an image over the whole window, uint8, shape (height, width, 3) of ``layout``."""
+        if self._visible:
+            self._background.show_image(image)
+            self._put_image()
+            self._window.show()
+            width, height = self._window.get_window_shape()
+            if (width, height) != image.shape[1::-1] and min(width, height) >= LEAST_PX:
+                self.layout = replace(self.layout, width=width, height=height)
+                self._background = BackgroundImage(self.layout, self.keys)
+
+    def presses(self) -> list[KeyOrClick]:
+        """The keys and clicks since the last call."""
+        if not self._visible:
+            return []
+        self._read_cursor()
+        keys = [event.key for event in self._window.get_events(ti.ui.PRESS)]
+        return [press for key in keys if (press := self._key_or_click(key)) is not None]
+
+    def _key_or_click(self, key: str) -> KeyOrClick | None:
+        if key == ti.ui.LMB:
+            return None if self._cursor is None else KeyOrClick(place=self._pixel(self._cursor))
+        return KeyOrClick(PRINTED[key]) if key in PRINTED else None
 
     # Input
 
@@ -343,7 +371,7 @@ class Window(Generic[UserSettings]):
 
     def _update_size(self) -> None:
         width, height = self._window.get_window_shape()
-        if (width, height) != (self.layout.width, self.layout.height) and min(width, height) >= 200:
+        if (width, height) != (self.layout.width, self.layout.height) and min(width, height) >= LEAST_PX:
             self._change_layout(replace(self.layout, width=width, height=height))
 
     def _change_layout(self, layout: WindowLayout) -> None:

@@ -39,7 +39,7 @@ def without_picture(patch):
     to draw.
     """
     patch.setattr(
-        "scenes.patients.check_picture.draw_check",
+        "scenes.patients.import_folder.draw_check",
         lambda patient, rows, folder: (folder / "check.png").touch(),
     )
 

@@ -50,6 +50,10 @@ NEEDING = {
 }
 
 
+# Options of the window alone: with others the rehearsal without a scene is that of the embedded patient.
+OF_ANY_PATIENT = ("out", "arch", "gamepad", "keys", "rate", *LinkOptions.model_fields)
+
+
 class RehearseOptions(LinkOptions, QualityOptions, ArchOptions):
     """What the user asks of a rehearsal."""
 
@@ -100,6 +104,12 @@ class RehearseOptions(LinkOptions, QualityOptions, ArchOptions):
         """The preset: of --quality, or the one for --rate."""
         chosen = self.set_by_user(*LEFT, *TISSUE_AND_STEP)
         return "fast" if self.rate is not None and not chosen else self.quality
+
+    @property
+    def leaves_patient_open(self) -> bool:
+        """Whether nothing says which patient to rehearse, or what of it."""
+        own = [name for name in type(self).model_fields if name not in OF_ANY_PATIENT]
+        return not self.changes and not self.set_by_user(*own)
 
     def check(self) -> None:
         """Raises CommandError for options that exclude each other, and for one without another that it

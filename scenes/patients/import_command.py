@@ -9,12 +9,10 @@ import numpy as np
 
 from errors import PatientError, UserError
 from scenes.atomic_files import check_folder
-from scenes.import_findings import FINDINGS_FILE, findings_text
 from scenes.patient_space import SPACES, Space
-from scenes.patients.patient_folder import public, save_patient
+from scenes.patients.patient_folder import public
 from scenes.patients.patient_position import POSITIONS, Position
 from scenes.patients.readers.segment_names import Side
-from scenes.scene import scene_text
 from scenes.terminal import bar, shell_command
 from text_files import read_text
 
@@ -127,11 +125,9 @@ def import_patient_command(
     if Path(probe).suffix:
         probe, texts = PROBE_FILE, {PROBE_FILE: read_text(Path(probe))}
     # Matplotlib and highdicom take 0.5 s to import.
-    from scenes.patients.check_picture import as_table, draw_check, summary_rows
+    from scenes.patients.check_picture import as_table
+    from scenes.patients.import_folder import save_import
     from scenes.patients.import_request import import_request
-    from scenes.patients.patient_complexity import complexity_of_patient
-    from scenes.patients.patient_findings import findings_of
-    from scenes.patients.patient_scene import fat_row, patient_scene, stiffness_row
 
     tissues = {TISSUE_OPTIONS[o]: label_words(text, o) for o, text in words.items() if text is not None}
     own = [] if organ is None else label_words(organ, "organ")
@@ -139,17 +135,8 @@ def import_patient_command(
     patient = import_request(
         ct, labels, own, tissues, side, series, seed_place, support, position, bar, space
     )
-    complexity = complexity_of_patient(patient)
+    click.echo(as_table(save_import(patient, out, probe, housing_mm, uniform, texts)))
     written = public(patient)
-    scene = patient_scene(patient, uniform, probe, housing_mm)
-    scene_rows = [stiffness_row(scene), fat_row(patient, scene)]
-    rows = [*summary_rows(written, complexity), *scene_rows]
-    texts |= {
-        "scene.toml": scene_text(scene),
-        FINDINGS_FILE: findings_text(findings_of(written, complexity)),
-    }
-    save_patient(written, out, texts, lambda folder: draw_check(written, rows, folder))
-    click.echo(as_table([*summary_rows(patient, complexity), *scene_rows]))
     if (written.notes, written.warnings) != (patient.notes, patient.warnings):
         click.echo("Names of labels that may be a person's are shown here, and are not in the files.")
     click.echo(

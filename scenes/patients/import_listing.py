@@ -1,6 +1,6 @@
 """The listing of ``import --list``: CT series and labels of the user's paths, before anything is made."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from errors import PatientError
 from scenes.patient_space import Space
 from scenes.patients.readers.ct_series import CtListing, LabelsRow, SeriesRow, list_ct
 from scenes.patients.readers.label_files import open_labels
-from scenes.patients.readers.label_maps import LabelMap
+from scenes.patients.readers.label_maps import Segment
 from scenes.terminal import Progress, silent
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -82,24 +82,37 @@ def _labels_text(path: Path, progress: Progress, space: Space | None) -> str:
     names.
     """
     if of_dicom := _dicom_labels(path, progress):
-        return of_dicom
-    maps = open_labels(path, progress=progress, space=space).maps(AS_THEY_ARE)
-    rows = [row for one in maps for row in _segment_rows(one)]
+        return _labels_table(of_dicom)
+    rows = [
+        (of.value, of.name, of.tissue, of.side, volume_ml)
+        for of, volume_ml in _segments(path, progress, space)
+    ]
     return f"{path.name}:\n" + _table(rows, SEGMENT_HEADS, floatfmt=".1f")
 
 
-def _dicom_labels(path: Path, progress: Progress) -> str:
+def segments_of(
+    path: Path, progress: Progress = silent, space: Space | None = None
+) -> list[tuple[Segment, float | None]]:
+    """The segments of a path's labels, each with its volume [ml]; of DICOM, which needs its CT for that,
+    without one.
+
+    Raises PatientError where the path cannot be read, or has no labels.
+    """
+    if of_dicom := _dicom_labels(path, progress):
+        return [(Segment.named(name), None) for row in of_dicom for name in row.segments]
+    return list(_segments(path, progress, space))
+
+
+def _dicom_labels(path: Path, progress: Progress) -> list[LabelsRow]:
     try:
-        return _labels_table(list_ct(path, progress).labels)
+        return list_ct(path, progress).labels
     except PatientError:
-        return ""
+        return []
 
 
-def _segment_rows(one: LabelMap) -> list[tuple]:
-    counts = np.zeros(1 + max(one.segments), int)
-    for plane in one.values:  # of a whole volume, bincount takes eight bytes a voxel
-        counts += np.bincount(plane.ravel(), minlength=len(counts))
-    return [
-        (segment.value, segment.name, segment.tissue, segment.side, counts[value] * one.grid.voxel_ml)
-        for value, segment in one.segments.items()
-    ]
+def _segments(path: Path, progress: Progress, space: Space | None) -> Iterator[tuple[Segment, float]]:
+    for one in open_labels(path, progress=progress, space=space).maps(AS_THEY_ARE):
+        counts = np.zeros(1 + max(one.segments), int)
+        for plane in one.values:  # of a whole volume, bincount takes eight bytes a voxel
+            counts += np.bincount(plane.ravel(), minlength=len(counts))
+        yield from ((segment, counts[value] * one.grid.voxel_ml) for value, segment in one.segments.items())
