@@ -3,7 +3,7 @@
 What can be clicked on has an action, a text; the keys of arrows go from one to the next.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,16 +14,16 @@ from render.ultrasound_panel import ALERT, FINDINGS, LINE, MARK, QUIET, TEXT
 from render.window_layout import Rect, WindowLayout
 
 PAGE, BUTTON, CHOSEN = (22, 26, 31), (34, 40, 47), (40, 62, 76)
-TITLE_PX, HEADING_PX, LETTERS_PX, PITCH_PX = 26, 16, 14, 19
-EDGE_PX, GAP_PX, BUTTON_PX, PAD_PX = 24, 12, 30, 10
-TOP_PX, FOOT_PX, MESSAGE_LINES = 76, 56, 4
-CARDS_PX, CARD_PX, PICTURE_PX, CARD_COLUMNS = 800, (394, 150), 128, 2
-SESSION_PX = 66
+TITLE_PX, HEADING_PX, LETTERS_PX, PITCH_PX = 28, 18, 16, 21
+EDGE_PX, GAP_PX, BUTTON_PX, PAD_PX = 24, 10, 32, 9
+TOP_PX, FOOT_PX, MESSAGE_LINES = 72, 54, 4
+CARDS_PX, CARD_PX, PICTURE_PX, CARD_COLUMNS = 832, (411, 162), 128, 2
+SESSION_PX = 68
 ROW_PX, LABELS_PX = 42, 96
 NAME_PX, TISSUE_PX, VOLUME_PX = 330, 190, 90
 # The parts of a check picture besides its text, as shares of its size: left, top, right, bottom.
 SECTIONS, SURFACES, COLOURS = (0.0, 0.06, 1.0, 0.505), (0.0, 0.515, 0.66, 0.97), (0.655, 0.9, 1.0, 0.97)
-PICTURES_PX = 770
+SECTIONS_PX, SURFACES_PX, COLOURS_PX = 400, 640, 64
 TOWARDS = {"Up": (0, -1), "Down": (0, 1), "Left": (-1, 0), "Right": (1, 0)}
 # Beside the way along an arrow, the way across it counts so many times.
 ACROSS = 3.0
@@ -49,6 +49,8 @@ class SessionRow:
     title: str
     text: str
     buttons: Mapping[str, str]
+    picture: np.ndarray | None = None
+    """That of its patient, uint8, shape (height, width, 3)."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,7 @@ class FormRow:
     name: str
     text: str
     buttons: tuple[Button, ...]
+    is_chosen: bool = False
 
 
 @dataclass(frozen=True)
@@ -156,7 +159,7 @@ def form_screen(
         left = page.left + px(LABELS_PX)
         for button in row.buttons:
             left = page.button(left, top, button).right + px(GAP_PX)
-        page.write(left, middle, row.text, LETTERS_PX, QUIET, page.right - left)
+        page.write(left, middle, row.text, LETTERS_PX, TEXT if row.is_chosen else QUIET, page.right - left)
         top += px(ROW_PX)
     page.lines(page.left, top + px(4), page.right - page.left, heading, TEXT)
     top += px(ROW_PX - 6)
@@ -196,43 +199,52 @@ def result_screen(
     layout: WindowLayout,
     title: str,
     picture: np.ndarray,
-    rows: Iterable[tuple[str, str]],
+    rows: Sequence[tuple[str, str]],
     buttons: Iterable[Button],
     selected: str = "",
-    first: int = 0,
+    number: int = 0,
 ) -> DrawnScreen:
-    """A check picture, uint8 (height, width, 3), with its text beside it, from a line of number ``first`` on:
-    rows of a title and a text, of which a WARNING stands out.
+    """A check picture, uint8 (height, width, 3), and its text: rows of a title and a text, of which warnings
+    stand out.
+
+    Page 0 has the sections and what fits of the text; those after it, of ``result_pages``, have the surfaces
+    and all of the text.
     """
     page, px = _Page(layout, title, selected), layout.px
-    width, foot = px(PICTURES_PX), layout.height - px(FOOT_PX)
-    half = (foot - px(TOP_PX) - px(GAP_PX)) // 2
-    page.picture(Rect(page.left, px(TOP_PX), width, half), _part(picture, SECTIONS))
-    below = px(TOP_PX) + half + px(GAP_PX)
-    page.picture(Rect(page.left, below, width * 2 // 3, half), _part(picture, SURFACES))
-    page.picture(Rect(page.left + width * 2 // 3, foot - px(70), width // 3, px(70)), _part(picture, COLOURS))
-    left, top = page.left + width + px(GAP_PX), px(TOP_PX)
-    for line, colour in _result_lines(layout, rows)[first : first + result_lines_that_fit(layout)]:
+    width, foot = page.right - page.left, layout.height - px(FOOT_PX)
+    if number == 0:
+        height = px(SECTIONS_PX)
+        page.picture(Rect(page.left, px(TOP_PX), width, height), _part(picture, SECTIONS))
+        left, top = page.left, px(TOP_PX) + height + px(GAP_PX)
+        lines = _result_lines(layout, rows, width)
+        fit = (foot - top) // px(PITCH_PX)
+        if len(lines) > fit:
+            lines = [*lines[: fit - 1], ("...", TEXT)]
+    else:
+        beside, colours = px(SURFACES_PX), px(COLOURS_PX)
+        whole = Rect(page.left, px(TOP_PX), beside, foot - px(TOP_PX) - colours)
+        page.picture(whole, _part(picture, SURFACES))
+        page.picture(Rect(page.left, foot - colours, beside, colours), _part(picture, COLOURS))
+        left, top = page.left + beside + px(GAP_PX), px(TOP_PX)
+        fit = (foot - top) // px(PITCH_PX)
+        lines = _result_lines(layout, rows, page.right - left)[(number - 1) * fit : number * fit]
+    for line, colour in lines:
         page.write(left, top + px(PITCH_PX) // 2, line, LETTERS_PX, colour)
         top += px(PITCH_PX)
     page.footer(buttons, "")
     return page.drawn()
 
 
-def result_line_count(layout: WindowLayout, rows: Iterable[tuple[str, str]]) -> int:
-    """How many lines the text beside a check picture has."""
-    return len(_result_lines(layout, rows))
-
-
-def result_lines_that_fit(layout: WindowLayout) -> int:
-    """How many of them fit."""
-    return (layout.height - layout.px(FOOT_PX + TOP_PX)) // layout.px(PITCH_PX)
+def result_pages(layout: WindowLayout, rows: Sequence[tuple[str, str]]) -> int:
+    """How many pages a result has."""
+    px = layout.px
+    lines = _result_lines(layout, rows, layout.width - px(2 * EDGE_PX + SURFACES_PX + GAP_PX))
+    return 1 + -(-len(lines) // ((layout.height - px(FOOT_PX) - px(TOP_PX)) // px(PITCH_PX)))
 
 
 def _result_lines(
-    layout: WindowLayout, rows: Iterable[tuple[str, str]]
+    layout: WindowLayout, rows: Iterable[tuple[str, str]], width: int
 ) -> list[tuple[str, tuple[int, int, int]]]:
-    width = layout.width - layout.px(2 * EDGE_PX + PICTURES_PX + GAP_PX)
     return [
         (line, ALERT if name in ("WARNING", "DRAFT") else TEXT)
         for name, text in rows
@@ -328,8 +340,12 @@ class _Page:
             button, letters = Button(action, text), font(self.layout.px(LETTERS_PX))
             left -= int(letters.getlength(text)) + px(3 * PAD_PX)
             self.button(left, box.top + (box.height - px(BUTTON_PX)) // 2, button)
-        room = left - box.left - px(2 * PAD_PX)
         at = box.left + px(PAD_PX)
+        if row.picture is not None:
+            size = box.height - px(PAD_PX)
+            self.picture(Rect(box.left + px(PAD_PX) // 2, box.top + px(PAD_PX) // 2, size, size), row.picture)
+            at += size
+        room = left - at - px(PAD_PX)
         self.write(at, box.top + box.height * 3 // 10, row.title, HEADING_PX, TEXT, room)
         self.write(at, box.top + box.height * 7 // 10, row.text, LETTERS_PX, QUIET, room)
 

@@ -21,7 +21,7 @@ ROLES = {"": "by name", "organ": "kidney", "tumour": "tumour", "cyst": "cyst", "
 SIDES: dict[Side | None, str] = {None: "by the labels", "left": "left", "right": "right"}
 # How a refusal names what is a choice here.
 ON_SCREEN = {
-    r"--side (left|right)": r"Kidney: \1",
+    r"--side (left|right)": r"Kidney \1",
     "--side": "Kidney",
     "--organ": "the button kidney",
     "--tumour": "the button tumour",
@@ -40,8 +40,6 @@ ASK = {
 class ImportForm:
     """What is imported; after a refusal it comes again, with its words and all choices."""
 
-    first = "CT file"
-
     def __init__(self, patients: Path, back: StartPage) -> None:
         self.keys = {"C": "CT file", "D": "CT folder", "L": "labels file", "G": "labels folder"}
         self.keys |= {"I": IMPORT, "N": MORE}
@@ -54,6 +52,13 @@ class ImportForm:
         self._dialog: FileDialog | None = None
         self._asked: Source = "CT"
         self._begin, self._shown, self._message = 0, 1, ""
+
+    @property
+    def first(self) -> str:
+        """As ``StartPage.first``: what comes next."""
+        if self._labels:
+            return IMPORT
+        return "labels file" if "CT" in self._paths else "CT file"
 
     def refuse(self, fault: str) -> None:
         """Show why the import has been refused."""
@@ -157,6 +162,8 @@ class ImportForm:
             return f"{self._reading.step or 'Reading the labels'} ..."
         if not self._labels:
             return "Choose the CT, then its labels. The patient's name is not copied."
+        if not any(label.name or label.tissue for label in self._labels):
+            return "The labels have no names: those for which you choose nothing count as the kidney."
         return "What each label is: the import recognises names; choose for those that it does not."
 
     def _source_row(self, source: Source) -> FormRow:
@@ -169,9 +176,8 @@ class ImportForm:
         hint = "a NIfTI, NRRD or MHA file, a zip archive or a folder with DICOM"
         if source == "labels":
             hint = "label map, surfaces, DICOM-SEG or RTSTRUCT; none: those in the CT's folder"
-        return FormRow(
-            source.capitalize() if source == "labels" else source, path.name if path else hint, buttons
-        )
+        name = {"CT": "CT", "labels": "Labels"}[source]
+        return FormRow(name, path.name if path else hint, buttons, path is not None)
 
     def _side_row(self) -> FormRow:
         buttons = tuple(Button(f"side {side}", text, "", side == self._side) for side, text in SIDES.items())
@@ -182,9 +188,8 @@ class ImportForm:
         volume = "" if label.volume_ml is None else f"{label.volume_ml:.1f} ml"
         role = self._roles.get(label.word, "")
         buttons = tuple(Button(f"label {place} {of}", text, "", of == role) for of, text in ROLES.items())
-        return LabelRow(
-            f"{value}{label.name or '(no name)'}", label.tissue or "not recognised", volume, buttons
-        )
+        name = f"{value}{label.name or '(no name)'}"
+        return LabelRow(name, label.tissue or "not recognised", volume, buttons)
 
     def _in_words(self, fault: str) -> str:
         """A refusal in the words of this page: without folders of the user, and with its choices."""

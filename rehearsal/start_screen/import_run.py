@@ -16,8 +16,7 @@ from render.start_screen import (
     Button,
     DrawnScreen,
     progress_screen,
-    result_line_count,
-    result_lines_that_fit,
+    result_pages,
     result_screen,
 )
 from render.window_layout import WindowLayout
@@ -95,7 +94,7 @@ class ImportResult:
         self._folder, self._rows, self._back = folder, rows, back
         with Image.open(folder / CHECK_PICTURE) as image:
             self._picture = np.asarray(image.convert("RGB"))
-        self._begin, self._shown, self._count = 0, 1, 0
+        self._number, self._pages = 0, 1
 
     def open(self) -> None:
         """As ``StartPage.open``."""
@@ -106,23 +105,21 @@ class ImportResult:
 
     def drawn(self, layout: WindowLayout, selected: str) -> DrawnScreen:
         """As ``StartPage.drawn``."""
-        self._shown, self._count = result_lines_that_fit(layout), result_line_count(layout, self._rows)
+        self._pages = result_pages(layout, self._rows)
         has_warning = any(name == "WARNING" for name, _ in self._rows)
         question = "are side, organ and orientation correct?"
         title = f"Imported: {'read the warnings, and compare with the patient' if has_warning else question}"
         buttons = [Button(REHEARSE, "Rehearse", "R"), Button(DISCARD, "Discard")]
-        if self._count > self._shown:
-            buttons.append(Button(MORE, "Further lines", "N"))
+        buttons.append(Button(MORE, f"Page {self._number + 1} of {self._pages}: next", "N"))
         buttons.append(Button(BACK, "Keep, and back to the list", "Esc"))
-        return result_screen(layout, title, self._picture, self._rows, buttons, selected, self._begin)
+        return result_screen(layout, title, self._picture, self._rows, buttons, selected, self._number)
 
     def act(self, action: str) -> Outcome:
         """As ``StartPage.act``."""
         if action == REHEARSE:
             return StartChoice(self._folder)
         if action == MORE:
-            following = self._begin + self._shown
-            self._begin = following if following < self._count else 0
+            self._number = (self._number + 1) % self._pages
             return self
         if action == DISCARD:
             shutil.rmtree(self._folder, ignore_errors=True)

@@ -92,7 +92,7 @@ def complexity_lines(figures: dict[str, Any] | None) -> list[str]:
 
 
 def _total(score: dict[str, Any]) -> str:
-    return f"{score['least']}" if score["least"] == score["most"] else f"{score['least']} to {score['most']}"
+    return f"{score['least']}" if score["least"] == score["most"] else f"{score['least']}-{score['most']}"
 
 
 def age_text(path: Path) -> str:

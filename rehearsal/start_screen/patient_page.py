@@ -33,6 +33,7 @@ class PatientPage:
         self._sessions: list[ListedSession] = []
         self._surveyed: dict[Path, PatientSurvey] = {}
         self._survey: BackgroundTask | None = None
+        self._to_survey: list[list[Path]] = []
         self._dialog: FileDialog | None = None
         # The first patient that is shown, and how many are.
         self._begin, self._shown = 0, 1
@@ -42,15 +43,19 @@ class PatientPage:
         """As ``StartPage.open``."""
         self._list()
         self._sessions, self._begin, self._message = listed_sessions(self._out), 0, ""
-        self._survey = BackgroundTask(survey, [patient.scene for patient in self._patients])
+        # The embedded patient last: at the first start its files must be made.
+        scenes = [patient.scene for patient in self._patients]
+        self._to_survey = [scenes[1:], scenes[:1]]
+        self._survey_next()
 
     def update(self) -> Outcome:
         """As ``StartPage.update``."""
         if self._survey is not None:
             self._survey.update()
             if self._survey.is_done:
-                self._surveyed, self._survey = self._survey.result or {}, None
+                self._surveyed |= self._survey.result or {}
                 self._list()
+                self._survey_next()
         if self._dialog is not None:
             self._dialog.update()
             if self._dialog.is_done:
@@ -96,6 +101,11 @@ class PatientPage:
                 task.stop()
         self._survey = self._dialog = None
 
+    def _survey_next(self) -> None:
+        """Begin with the next patients to find something out of, if there are any."""
+        scenes = self._to_survey.pop(0) if self._to_survey else None
+        self._survey = None if scenes is None else BackgroundTask(survey, scenes)
+
     def _list(self) -> None:
         of_embedded = self._surveyed.get(EMBEDDED)
         figures = None if of_embedded is None else of_embedded.complexity
@@ -105,9 +115,8 @@ class PatientPage:
         patient = self._patient_of(session)
         if patient is None:
             return SessionRow(UNKNOWN if self._survey is None else LOOKING, session.text, {})
-        return SessionRow(
-            patient.title, session.text, {f"{REPLAY}{place}": "Replay", f"{GO_ON}{place}": "Go on"}
-        )
+        buttons = {f"{REPLAY}{place}": "Replay", f"{GO_ON}{place}": "Go on"}
+        return SessionRow(patient.title, session.text, buttons, patient.picture)
 
     def _patient_of(self, session: ListedSession) -> ListedPatient | None:
         """The patient whose anatomy a session has, once that is known."""

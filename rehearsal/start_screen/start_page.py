@@ -30,8 +30,10 @@ class StartPage(Protocol):
 
     keys: dict[str, str]
     """The action of each key, besides arrows, Return, and Esc, which is BACK."""
-    first: str
-    """The action that is selected first."""
+
+    @property
+    def first(self) -> str:
+        """The action that is selected at first, and when this changes."""
 
     def open(self) -> None:
         """The page is shown from now on."""
@@ -72,7 +74,8 @@ class StartScreen:
     """The pages in a window, from one to the next, until the user chooses."""
 
     def __init__(self, viewer: StartViewer, page: StartPage) -> None:
-        self._viewer, self._page, self._selected = viewer, page, ""
+        self._viewer, self._page = viewer, page
+        self._selected = self._first = page.first
 
     def choice(self) -> StartChoice | None:
         """What the user chooses; None where the window is closed, or Esc quits."""
@@ -92,8 +95,9 @@ class StartScreen:
     def _show(self, page: StartPage) -> None:
         if page is not self._page:
             self._page.close()
-            self._page, self._selected = page, page.first
+            self._page = page
             page.open()
+            self._selected = self._first = page.first
 
     def _updated(self) -> Outcome:
         return self._page.update()
@@ -101,9 +105,11 @@ class StartScreen:
     def _used(self) -> Outcome:
         """Draw the page, and do what the user asks, up to what leads to another page."""
         page = self._page
+        if page.first != self._first:
+            self._selected = self._first = page.first
         screen = page.drawn(self._viewer.layout, self._selected)
         if self._selected not in screen.boxes:
-            self._selected = page.first if page.first in screen.boxes else next(iter(screen.boxes), "")
+            self._selected = next(iter(screen.boxes), "")
             screen = page.drawn(self._viewer.layout, self._selected)
         self._viewer.show_image(screen.image)
         for press in self._viewer.presses():
