@@ -54,7 +54,8 @@ def opened(options: RehearseOptions, process: StartedProcess | None) -> Iterator
             check_graphics()
             arch = start_taichi(options.arch)
             viewer = resources.enter_context(window(options, keys_of(options)))
-            options = with_choice(options, viewer)
+            with start.paused():
+                options = with_choice(options, viewer)
         start.begin("Files")
         files = read_files(options)
         for warning in warning_lines(files.warnings, files.folder):

@@ -16,17 +16,19 @@ from render.window_layout import Rect, WindowLayout
 PAGE, BUTTON, CHOSEN = (22, 26, 31), (34, 40, 47), (40, 62, 76)
 TITLE_PX, HEADING_PX, LETTERS_PX, PITCH_PX = 28, 18, 16, 21
 EDGE_PX, GAP_PX, BUTTON_PX, PAD_PX = 24, 10, 32, 9
-TOP_PX, FOOT_PX, MESSAGE_LINES = 72, 54, 4
-CARDS_PX, CARD_PX, PICTURE_PX, CARD_COLUMNS = 832, (411, 162), 128, 2
-SESSION_PX = 68
+TOP_PX, FOOT_PX = 72, 54
+CARDS_PX, CARD_PX, PICTURE_PX, CARD_COLUMNS = 832, (411, 162), 112, 2
+SESSION_PX = 84
 ROW_PX, LABELS_PX = 42, 96
 NAME_PX, TISSUE_PX, VOLUME_PX = 330, 190, 90
 # The parts of a check picture besides its text, as shares of its size: left, top, right, bottom.
 SECTIONS, SURFACES, COLOURS = (0.0, 0.06, 1.0, 0.505), (0.0, 0.515, 0.66, 0.97), (0.655, 0.9, 1.0, 0.97)
-SECTIONS_PX, SURFACES_PX, COLOURS_PX = 400, 640, 64
+SECTIONS_PX, SURFACES_PX, COLOURS_PX = 400, 760, 64
 TOWARDS = {"Up": (0, -1), "Down": (0, 1), "Left": (-1, 0), "Right": (1, 0)}
 # Beside the way along an arrow, the way across it counts so many times.
 ACROSS = 3.0
+# And an action further to its side than this share allows is not in its direction.
+LEAST_AHEAD = 1 / 3
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,8 @@ class SessionRow:
     """A session to replay; ``buttons`` has the text of each action."""
 
     title: str
-    text: str
+    lines: tuple[str, ...]
+    """Up to two."""
     buttons: Mapping[str, str]
     picture: np.ndarray | None = None
     """That of its patient, uint8, shape (height, width, 3)."""
@@ -98,7 +101,11 @@ class DrawnScreen:
         """The nearest action from one in the direction of an arrow's key; itself where there is none."""
         here, (x, y) = _middle(self.boxes[action]), TOWARDS[key]
         ways = {other: _middle(box) - here for other, box in self.boxes.items()}
-        ahead = {other: way @ (x, y) for other, way in ways.items() if way @ (x, y) > 1}
+        ahead = {
+            other: way @ (x, y)
+            for other, way in ways.items()
+            if way @ (x, y) > max(1.0, LEAST_AHEAD * abs(way @ (y, x)))
+        }
         return min(ahead, key=lambda other: ahead[other] + ACROSS * abs(ways[other] @ (y, x)), default=action)
 
 
@@ -135,9 +142,9 @@ def list_screen(
     return page.drawn()
 
 
-def cards_that_fit(layout: WindowLayout) -> int:
-    """How many cards of patients fit above messages and buttons."""
-    room = _message_top(layout) - layout.px(TOP_PX)
+def cards_that_fit(layout: WindowLayout, message: str) -> int:
+    """How many cards of patients fit above a message and the buttons."""
+    room = _message_top(layout, message) - layout.px(TOP_PX)
     return CARD_COLUMNS * max(1, room // layout.px(CARD_PX[1] + GAP_PX))
 
 
@@ -175,9 +182,9 @@ def form_screen(
     return page.drawn()
 
 
-def labels_that_fit(layout: WindowLayout, rows: int) -> int:
-    """How many labels fit under so many rows of choices."""
-    room = _message_top(layout) - layout.px(TOP_PX) - (rows + 1) * layout.px(ROW_PX)
+def labels_that_fit(layout: WindowLayout, rows: int, message: str) -> int:
+    """How many labels fit between so many rows of choices and a message."""
+    room = _message_top(layout, message) - layout.px(TOP_PX) - (rows + 1) * layout.px(ROW_PX)
     return max(1, room // layout.px(BUTTON_PX + 4))
 
 
@@ -258,8 +265,14 @@ def _part(picture: np.ndarray, shares: tuple[float, float, float, float]) -> np.
     return picture[round(top * height) : round(bottom * height), round(left * width) : round(right * width)]
 
 
-def _message_top(layout: WindowLayout) -> int:
-    return layout.height - layout.px(FOOT_PX + MESSAGE_LINES * PITCH_PX + GAP_PX)
+def _message_lines(layout: WindowLayout, message: str) -> list[str]:
+    return folded(message, layout.px(LETTERS_PX), layout.width - layout.px(2 * EDGE_PX))
+
+
+def _message_top(layout: WindowLayout, message: str) -> int:
+    """Where a message begins, above the buttons."""
+    lines = len(_message_lines(layout, message))
+    return layout.height - layout.px(FOOT_PX) - lines * layout.px(PITCH_PX)
 
 
 def folded(text: str, size: int, width: int) -> list[str]:
@@ -346,8 +359,9 @@ class _Page:
             self.picture(Rect(box.left + px(PAD_PX) // 2, box.top + px(PAD_PX) // 2, size, size), row.picture)
             at += size
         room = left - at - px(PAD_PX)
-        self.write(at, box.top + box.height * 3 // 10, row.title, HEADING_PX, TEXT, room)
-        self.write(at, box.top + box.height * 7 // 10, row.text, LETTERS_PX, QUIET, room)
+        self.write(at, box.top + px(18), row.title, HEADING_PX, TEXT, room)
+        for place, text in enumerate(row.lines, 1):
+            self.write(at, box.top + px(18 + place * PITCH_PX), text, LETTERS_PX, QUIET, room)
 
     def footer(self, buttons: Iterable[Button], message: str) -> None:
         """Buttons at the foot, and a message above them."""
@@ -355,10 +369,8 @@ class _Page:
         for button in buttons:
             box = self.button(left, self.layout.height - px(FOOT_PX - 14), button)
             left = box.right + px(GAP_PX)
-        room = self.right - self.left
-        shown = folded(message, px(LETTERS_PX), room)
-        top = self.layout.height - px(FOOT_PX) - len(shown[:MESSAGE_LINES]) * px(PITCH_PX)
-        for line in shown[:MESSAGE_LINES]:
+        top = _message_top(self.layout, message)
+        for line in _message_lines(self.layout, message):
             self.write(self.left, top + px(PITCH_PX) // 2, line, LETTERS_PX, ALERT)
             top += px(PITCH_PX)
 

@@ -1,5 +1,7 @@
 """How long each stage of the start takes, from the begin of the process on."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from time import time
 
@@ -21,6 +23,15 @@ class StartTimes:
     def begin(self, stage: str) -> None:
         """The next stage begins."""
         self._begins.append((stage, self.now_s))
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """The time that the user takes in this context is not counted."""
+        before = time()
+        try:
+            yield
+        finally:
+            self._created_s += time() - before
 
     def seconds(self) -> dict[str, float]:
         """How long each stage but the last has lasted."""

@@ -89,7 +89,7 @@ class ImportForm:
     def drawn(self, layout: WindowLayout, selected: str) -> DrawnScreen:
         """As ``StartPage.drawn``."""
         rows = [self._source_row("CT"), self._source_row("labels"), self._side_row()]
-        self._shown, found = labels_that_fit(layout, len(rows)), self._labels or []
+        self._shown, found = labels_that_fit(layout, len(rows), self._message), self._labels or []
         labels = [
             self._label_row(place, label)
             for place, label in enumerate(found)

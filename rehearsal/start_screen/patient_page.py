@@ -67,7 +67,7 @@ class PatientPage:
 
     def drawn(self, layout: WindowLayout, selected: str) -> DrawnScreen:
         """As ``StartPage.drawn``."""
-        self._shown = cards_that_fit(layout)
+        self._shown = cards_that_fit(layout, self._message)
         places = range(self._begin, min(self._begin + self._shown, len(self._patients)))
         cards = [card_of(f"{PATIENT}{place}", self._patients[place]) for place in places]
         sessions = [self._row(place, session) for place, session in enumerate(self._sessions)]
@@ -114,9 +114,9 @@ class PatientPage:
     def _row(self, place: int, session: ListedSession) -> SessionRow:
         patient = self._patient_of(session)
         if patient is None:
-            return SessionRow(UNKNOWN if self._survey is None else LOOKING, session.text, {})
+            return SessionRow(UNKNOWN if self._survey is None else LOOKING, session.lines, {})
         buttons = {f"{REPLAY}{place}": "Replay", f"{GO_ON}{place}": "Go on"}
-        return SessionRow(patient.title, session.text, buttons, patient.picture)
+        return SessionRow(patient.title, session.lines, buttons, patient.picture)
 
     def _patient_of(self, session: ListedSession) -> ListedPatient | None:
         """The patient whose anatomy a session has, once that is known."""

@@ -10,7 +10,7 @@ from rehearsal.result_files import counted
 from rehearsal.start_screen.patient_list import age_text
 
 SESSION_NAME = r"session-([0-9]{3,9})\.jsonl"
-MOST_SESSIONS = 6
+MOST_SESSIONS = 5
 # The first and the last line of a session's file have at most this length, or they are not read.
 MOST_LINE_BYTES = 2_000_000
 
@@ -21,7 +21,7 @@ class ListedSession:
 
     path: Path
     anatomy: str
-    text: str
+    lines: tuple[str, ...]
 
 
 def listed_sessions(folder: Path) -> list[ListedSession]:
@@ -44,7 +44,7 @@ def _listed(path: Path) -> ListedSession | None:
     anatomy = header.get("anatomy")
     if not isinstance(anatomy, str):
         return None
-    return ListedSession(path, anatomy, f"{_contents(end.get('summary'))}, {age_text(path)}")
+    return ListedSession(path, anatomy, (_contents(end.get("summary")), age_text(path)))
 
 
 def _contents(summary: Any) -> str:
