@@ -192,9 +192,9 @@ class ImportForm:
         return LabelRow(name, label.tissue or "not recognised", volume, buttons)
 
     def _in_words(self, fault: str) -> str:
-        """A refusal in the words of this page: without folders of the user, and with its choices."""
-        for path in self._paths.values():
-            fault = fault.replace(str(path), path.name)
+        """A refusal in the words of this page: without the user's paths, and with its choices."""
+        for source, path in self._paths.items():
+            fault = fault.replace(str(path), f"the {source}")
         for option, words in ON_SCREEN.items():
             fault = re.sub(option, words, fault)
         return f"{fault}. {BY_COMMAND} {new_folder_name(self._patients)}" if "--" in fault else fault
