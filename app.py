@@ -115,7 +115,7 @@ COMMANDS = {
 def cli() -> None:
     """Nephron: rehearse ultrasound on a patient's own deformable kidney.
 
-    Without a command it is `rehearse` on the embedded patient.
+    Without a command it is `rehearse`.
     """
 
 

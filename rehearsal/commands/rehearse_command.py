@@ -16,7 +16,8 @@ from render.keys import keys_text
 def rehearse(options: RehearseOptions) -> None:
     """Press the kidney of SCENE with the probe and see its ultrasound image.
 
-    SCENE is a scene file or a patient's folder; without one it is the embedded patient.
+    SCENE is a scene file or a patient's folder. Without one and without options for it, a start screen opens;
+    else it is the embedded patient.
     """
     if not options.headless and not display_available():
         click.echo(f"No display ({why_no_display()}): running the scripted press without a window.")
