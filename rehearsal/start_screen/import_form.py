@@ -52,16 +52,19 @@ class ImportForm:
         self._dialog: FileDialog | None = None
         self._asked: Source = "CT"
         self._begin, self._shown, self._message = 0, 1, ""
+        # Whether the import was refused for want of it.
+        self._needs_side = False
 
     @property
     def first(self) -> str:
         """As ``StartPage.first``: what comes next."""
         if self._labels:
-            return IMPORT
+            return "side left" if self._needs_side and self._side is None else IMPORT
         return "labels file" if "CT" in self._paths else "CT file"
 
     def refuse(self, fault: str) -> None:
         """Show why the import has been refused."""
+        self._needs_side = "--side left" in fault
         self._message = self._in_words(fault)
 
     def open(self) -> None:
@@ -145,6 +148,7 @@ class ImportForm:
         if self._reading is not None:
             self._reading.stop()
         self._labels, self._roles, self._begin, self._reading = None, {}, 0, None
+        self._needs_side = False
         ct, labels = self._paths.get("CT"), self._paths.get("labels")
         if ct is not None and (labels is not None or ct.is_dir()):
             self._reading = BackgroundTask(found_labels, ct, labels)

@@ -40,7 +40,7 @@ class ImportRun:
     def __init__(self, choices: ImportChoices, folder: Path, form: RefusedPage, back: StartPage) -> None:
         self.keys: dict[str, str] = {}
         self._choices, self._folder, self._form, self._back = choices, folder, form, back
-        self._steps: list[str] = []
+        self._steps = ["Starting the import"]
         self._task: BackgroundTask | None = None
         self._began = perf_counter()
 

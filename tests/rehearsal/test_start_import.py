@@ -174,10 +174,12 @@ def test_a_ct_folder_without_labels_asks_for_them(form, tmp_path, choosing):
 
 def test_two_kidneys_are_refused_with_the_choice_that_helps(filled):
     page = imported(filled)
-    assert page is filled and has_message(page.drawn(LAYOUT, "")) and page.first == "import"
+    assert page is filled and has_message(page.drawn(LAYOUT, "")) and page.first == "side left"
     assert "2 organs are labelled, expected one" in page._message
     assert "Kidney left or Kidney right" in page._message and "--" not in page._message
     assert {"side left", "side right"} <= boxes(page)
+    page.act("side right")
+    assert page.first == "import"
 
 
 def test_a_refusal_has_no_folder_of_the_patient_and_names_the_command(filled, hospital, choosing):
@@ -249,7 +251,7 @@ def test_the_steps_are_shown_as_they_come(filled, monkeypatch):
     for step in ("Reading: 1 of 2", "Reading: 2 of 2", "Making the surfaces: 1 of 1"):
         run._task.step = step
         assert run.update() is run
-        steps.append(list(run._steps))
+        steps.append(run._steps[1:])
     assert steps == [
         ["Reading: 1 of 2"],
         ["Reading: 2 of 2"],
