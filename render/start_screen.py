@@ -22,8 +22,8 @@ SESSION_PX = 84
 ROW_PX, LABELS_PX = 42, 96
 NAME_PX, TISSUE_PX, VOLUME_PX = 330, 190, 90
 # The parts of a check picture besides its text, as shares of its size: left, top, right, bottom.
-SECTIONS, SURFACES, COLOURS = (0.0, 0.06, 1.0, 0.505), (0.0, 0.515, 0.66, 0.97), (0.655, 0.9, 1.0, 0.97)
-SECTIONS_PX, SURFACES_PX, COLOURS_PX = 400, 760, 64
+SECTIONS, SURFACES, COLOURS = (0.0, 0.05, 1.0, 0.52), (0.0, 0.52, 0.66, 1.0), (0.66, 0.905, 1.0, 1.0)
+SECTIONS_PX, SURFACES_PX, COLOURS_PX = 400, 760, 84
 TOWARDS = {"Up": (0, -1), "Down": (0, 1), "Left": (-1, 0), "Right": (1, 0)}
 # Beside the way along an arrow, the way across it counts so many times.
 ACROSS = 3.0

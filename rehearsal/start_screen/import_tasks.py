@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from errors import PatientError, UserError
+from errors import UserError
 from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
 from scenes.patients.readers.segment_names import Side
 from scenes.scene import EMBEDDED, Scene, load_scene, scene_file
@@ -68,15 +68,11 @@ def found_labels(ct: Path, labels: Path | None, progress: ReportProgress) -> lis
 
     Raises PatientError.
     """
-    from scenes.patients.import_listing import segments_of
+    from scenes.patients.import_listing import segments_of, segments_with_ct
 
     progress("Reading the labels")
-    try:
-        found = segments_of(labels or ct, _steps(progress))
-    except PatientError:
-        if labels is not None:
-            raise
-        return []
+    steps = _steps(progress)
+    found = segments_with_ct(ct, steps) if labels is None else segments_of(labels, steps)
     return [
         FoundLabel(of.name or str(of.value), of.value, of.name, of.tissue or "", volume_ml)
         for of, volume_ml in found

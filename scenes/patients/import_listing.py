@@ -99,8 +99,20 @@ def segments_of(
     Raises PatientError where the path cannot be read, or has no labels.
     """
     if of_dicom := _dicom_labels(path, progress):
-        return [(Segment.named(name), None) for row in of_dicom for name in row.segments]
+        return _named(of_dicom)
     return list(_segments(path, progress, space))
+
+
+def segments_with_ct(ct: Path, progress: Progress = silent) -> list[tuple[Segment, float | None]]:
+    """The segments of the DICOM labels in a CT's path, without volumes; none where there are no labels.
+
+    Raises PatientError where the path cannot be read.
+    """
+    return _named(list_ct(ct, progress).labels)
+
+
+def _named(rows: list[LabelsRow]) -> list[tuple[Segment, float | None]]:
+    return [(Segment.named(name), None) for row in rows for name in row.segments]
 
 
 def _dicom_labels(path: Path, progress: Progress) -> list[LabelsRow]:

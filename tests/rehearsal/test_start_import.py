@@ -8,7 +8,8 @@ from time import monotonic, sleep
 import numpy as np
 import pytest
 import SimpleITK as sitk
-from synthetic_body import LEFT_ML, body, coarsely
+from dicom_series import Series, write_segmentation
+from synthetic_body import DIRECTIONS, LEFT_ML, body, coarsely
 
 from errors import PatientError
 from rehearsal.start_screen import import_form, import_run
@@ -166,10 +167,23 @@ def test_another_ct_takes_its_own_labels(filled, hospital, choosing):
     assert "import" not in boxes(filled) and filled.first == "labels file"
 
 
-def test_a_ct_folder_without_labels_asks_for_them(form, tmp_path, choosing):
-    (tmp_path / "dicom").mkdir()
+def test_labels_beside_a_dicom_ct_need_no_choice_and_without_them_it_asks(form, tmp_path, choosing):
+    series = Series(tmp_path / "dicom", DIRECTIONS["identity"], size=(40, 40, 8), gap=4.0)
+    series.write()
     take(form, choosing, "CT folder", tmp_path / "dicom")
-    assert has_message(form.drawn(LAYOUT, "")) and "choose the labels" in form._message
+    assert "import" not in boxes(form) and "choose the labels" in form._message
+    places = np.stack([series.places(k) for k in range(8)])
+    masks = {"Left kidney": np.linalg.norm(places - places.mean(axis=(0, 1, 2)), axis=-1) < 12}
+    write_segmentation(tmp_path / "dicom" / "labels.dcm", series, masks)
+    take(form, choosing, "CT folder", tmp_path / "dicom")
+    assert form.first == "import" and not has_message(form.drawn(LAYOUT, ""))
+    assert [(label.word, label.tissue) for label in form._labels] == [("Left kidney", "kidney")]
+
+
+def test_a_folder_without_a_ct_is_refused_in_words(form, tmp_path, choosing):
+    (tmp_path / "empty").mkdir()
+    take(form, choosing, "CT folder", tmp_path / "empty")
+    assert has_message(form.drawn(LAYOUT, "")) and form._message.startswith("the CT: ")
 
 
 def test_two_kidneys_are_refused_with_the_choice_that_helps(filled):

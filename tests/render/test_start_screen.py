@@ -4,9 +4,14 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from conftest import ROOT
+from PIL import Image
 
 from render.start_screen import (
+    COLOURS,
     PAGE,
+    SECTIONS,
+    SURFACES,
     Button,
     DrawnScreen,
     FormRow,
@@ -157,6 +162,20 @@ def test_what_is_selected_has_a_frame_of_its_own():
     assert changed[box.slices].any()
     changed[box.slices] = False
     assert not changed.any()
+
+
+@pytest.mark.parametrize("part", [SECTIONS, SURFACES, COLOURS])
+def test_no_part_of_a_check_picture_is_cut_through(part):
+    # That of the embedded patient has the tallest sections, and all colours.
+    picture = np.asarray(Image.open(ROOT / "docs" / "check.png").convert("RGB")).astype(int)
+    left, top, right, bottom = (
+        round(share * size) for share, size in zip(part, (1300, 960) * 2, strict=True)
+    )
+    ink = np.abs(picture - picture[0, 0]).max(axis=2) > 8
+    assert ink[top:bottom, left:right].any()
+    for edge in (ink[top, left:right], ink[bottom - 1, left:right], ink[top:bottom, left]):
+        assert not edge.any()
+    assert not ink[top:bottom, right - 1].any()
 
 
 class TestResult:
