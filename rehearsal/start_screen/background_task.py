@@ -54,10 +54,12 @@ class BackgroundTask:
 
     def stop(self) -> None:
         """End the process, if it has not ended, and those that it has started."""
-        with suppress(psutil.NoSuchProcess):
-            for child in psutil.Process(self._process.pid).children(recursive=True):
-                child.kill()
-        self._process.kill()
+        # The id of one that has ended may be another's by now.
+        if self._process.is_alive():
+            with suppress(psutil.NoSuchProcess):
+                for child in psutil.Process(self._process.pid).children(recursive=True):
+                    child.kill()
+            self._process.kill()
         self._process.join()
         self._connection.close()
         self.is_done = True

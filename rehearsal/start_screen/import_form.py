@@ -83,6 +83,7 @@ class ImportForm:
             self._reading.update()
             if self._reading.is_done:
                 reading, self._reading = self._reading, None
+                reading.stop()
                 self._labels = reading.result
                 self._message = self._in_words(reading.fault)
                 if self._labels == []:

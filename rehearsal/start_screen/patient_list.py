@@ -3,6 +3,7 @@
 No name of a folder is shown, as it may be the patient's.
 """
 
+import os
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -47,15 +48,17 @@ class ListedPatient:
     @property
     def picture(self) -> np.ndarray | None:
         """A section of its CT, uint8, shape (height, width, 3); None without one."""
-        of_embedded = self.scene == EMBEDDED
-        return first_section(EMBEDDED_PICTURE if of_embedded else self.scene / CHECK_PICTURE)
+        path = EMBEDDED_PICTURE if self.scene == EMBEDDED else self.scene / CHECK_PICTURE
+        return first_section(path, path.stat().st_mtime_ns) if path.is_file() else None
 
 
 def listed_patients(folder: Path, figures: dict[str, Any] | None = None) -> list[ListedPatient]:
     """The embedded patient, with the figures of its complexity once they are known, and the patients in the
     subfolders of a folder, the last imported first.
     """
-    found = [path for path in folder.glob("*") if (path / SCENE_FILE).is_file()]
+    # A hidden folder is one that an import is writing, or has left when it was stopped.
+    shown = [path for path in folder.glob("*") if not path.name.startswith(".")]
+    found = [path for path in shown if os.path.isfile(path / SCENE_FILE)]
     found.sort(key=lambda path: (path / SCENE_FILE).stat().st_mtime, reverse=True)
     about = "Left kidney with a tumour, drawn from formulas: no patient's data"
     embedded = ListedPatient(EMBEDDED, "Embedded patient", (about, *complexity_lines(figures)))
@@ -114,8 +117,10 @@ def new_folder_name(folder: Path) -> Path:
 
 
 @lru_cache(maxsize=64)
-def first_section(path: Path) -> np.ndarray | None:
-    """The first section of a check picture, uint8, shape (height, width, 3); None without a picture."""
+def first_section(path: Path, written_ns: int) -> np.ndarray | None:
+    """The first section of a check picture that was written at a time, uint8, shape (height, width, 3); None
+    where it cannot be read.
+    """
     try:
         with Image.open(path) as image:
             width, height = image.size

@@ -41,11 +41,13 @@ class PatientPage:
 
     def open(self) -> None:
         """As ``StartPage.open``."""
+        # A folder may have another patient than before; the embedded one stays.
+        self._surveyed = {scene: of for scene, of in self._surveyed.items() if scene == EMBEDDED}
         self._list()
         self._sessions, self._begin, self._message = listed_sessions(self._out), 0, ""
         # The embedded patient last: at the first start its files must be made.
         scenes = [patient.scene for patient in self._patients]
-        self._to_survey = [scenes[1:], scenes[:1]]
+        self._to_survey = [scenes[1:], [] if EMBEDDED in self._surveyed else scenes[:1]]
         self._survey_next()
 
     def update(self) -> Outcome:
@@ -53,6 +55,7 @@ class PatientPage:
         if self._survey is not None:
             self._survey.update()
             if self._survey.is_done:
+                self._survey.stop()
                 self._surveyed |= self._survey.result or {}
                 self._list()
                 self._survey_next()
@@ -103,8 +106,8 @@ class PatientPage:
 
     def _survey_next(self) -> None:
         """Begin with the next patients to find something out of, if there are any."""
-        scenes = self._to_survey.pop(0) if self._to_survey else None
-        self._survey = None if scenes is None else BackgroundTask(survey, scenes)
+        self._to_survey = [scenes for scenes in self._to_survey if scenes]
+        self._survey = BackgroundTask(survey, self._to_survey.pop(0)) if self._to_survey else None
 
     def _list(self) -> None:
         of_embedded = self._surveyed.get(EMBEDDED)

@@ -16,7 +16,6 @@ from rehearsal.sessions.session_file import EndLine
 from rehearsal.start_screen.patient_list import (
     EMBEDDED_PICTURE,
     complexity_lines,
-    first_section,
     listed_patient,
     listed_patients,
     new_folder_name,
@@ -53,6 +52,8 @@ def test_the_embedded_patient_is_first_then_the_last_imported(tmp_path):
     for name, age_s in (("old", 90_000), ("new", 10), ("middle", 7300)):
         patient(tmp_path / name, age_s)
     (tmp_path / "no patient").mkdir()
+    # What an import is still writing.
+    patient(tmp_path / ".12-ab.partial-patient-001")
     listed = listed_patients(tmp_path)
     assert [each.scene for each in listed] == [EMBEDDED, *(tmp_path / n for n in ("new", "middle", "old"))]
     ages = [each.lines[-1] for each in listed[1:]]
@@ -100,11 +101,15 @@ def test_a_picture_is_the_middle_of_the_first_section(tmp_path):
     picture = np.zeros((960, 1300, 3), np.uint8)
     picture[240:330, 180:290] = 200
     Image.fromarray(picture).save(folder / "check.png")
-    first_section.cache_clear()
     shown = listed_patient(folder).picture
     assert shown.shape[0] == pytest.approx(shown.shape[1], abs=2)
     bright = np.argwhere(shown[..., 0] > 0).mean(axis=0) / shown.shape[:2]
     assert bright == pytest.approx([0.5, 0.5], abs=0.05)
+    # Another patient in the folder has another picture.
+    Image.fromarray(255 - picture).save(folder / "check.png")
+    assert listed_patient(folder).picture[0, 0, 0] == 255
+    (folder / "check.png").write_bytes(b"no picture")
+    assert listed_patient(folder).picture is None
     assert EMBEDDED_PICTURE == ROOT / "docs" / "check.png" and EMBEDDED_PICTURE.is_file()
 
 
