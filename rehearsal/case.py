@@ -51,6 +51,15 @@ class Case:
         return direction / np.linalg.norm(direction)
 
     @property
+    def lateral(self) -> np.ndarray:
+        """Unit vector (3,) to the side of the patient that the kidney is on: away from its hilum, or where
+        the scene names none, from the midline of the CT's coordinates.
+        """
+        hilum = self.scene.attachment.at_mm
+        medial = 0.0 if hilum is None else hilum[0]
+        return np.array([np.copysign(1.0, self.origin[0] - medial), 0.0, 0.0])
+
+    @property
     def size_mm(self) -> np.ndarray:
         """The transducer's size (3,)."""
         return np.array(self.probe.housing_mm)

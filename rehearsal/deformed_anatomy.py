@@ -18,6 +18,7 @@ from rehearsal.resection.judgement import Carried, Judgement, judge
 from rehearsal.resection.resection_state import Resection, cut_of
 from rehearsal.resection.score_line import ResectionError
 from rehearsal.tissue_voxels import tissue_voxels
+from rehearsal.vessel_kinds import vessel_kinds
 from scenes.anatomy import Grid, LoadedAnatomy
 from scenes.surfaces import FineSurface, translated, volume_mm3
 from sim.embedding import Embedding
@@ -171,6 +172,15 @@ class DeformedAnatomy:
         """The vertices (n,) of other parts, by tissue."""
         return {name: self._skins[f"part {name}"].vertices for name in self.geometry.parts}
 
+    def vessel_kinds(self) -> np.ndarray | None:
+        """Artery, vein, or vessel where no label says which, of the vertices (n,) of the vessels; None
+        without any.
+        """
+        vessels = self.geometry.parts.get("vessel")
+        if vessels is None:
+            return None
+        return vessel_kinds(vessels.vertices, self._moved_labels(), self._labels[1])
+
     def find_plane(self, probe: Probe) -> None:
         """Locate the image plane in the tissue without computing an image."""
         if self.scanner is not None:
@@ -222,12 +232,30 @@ class DeformedAnatomy:
         """
         if self.cut is None:
             raise ResectionError("nothing was cut yet")
-        vertices = self.carried_then(self.cut.specimen.vertices)
+        return self._beside(np.asarray(self.cut.specimen.vertices))
+
+    def _beside(self, points: np.ndarray) -> np.ndarray:
+        """Where points (n, 3) [mm] of the specimen at rest are, beside the organ. Raises ResectionError."""
+        if self.cut is None:
+            raise ResectionError("nothing was cut yet")
+        specimen = self.carried_then(self.cut.specimen.vertices)
         long_axis = np.array(self.case.press.lateral)
-        organ, own = np.asarray(self.case.organ.vertices) @ long_axis, vertices @ long_axis
+        organ, own = np.asarray(self.case.organ.vertices) @ long_axis, specimen @ long_axis
         side = 1.0 if own.mean() >= organ.mean() else -1.0
         reach = (side * organ).max() - (side * own).min()
-        return vertices + side * (reach + BESIDE_MM) * long_axis
+        return self.carried_then(points) + side * (reach + BESIDE_MM) * long_axis
+
+    def tumour_beside(self) -> np.ndarray:
+        """Vertices (n, 3) [mm] of ``tumour_in_specimen``, in the specimen beside the organ."""
+        tumour = self.tumour_in_specimen
+        return np.zeros((0, 3)) if tumour is None else self._beside(np.asarray(tumour.vertices))
+
+    @property
+    def tumour_in_specimen(self) -> trimesh.Trimesh | None:
+        """The surface at rest of the tumour that was cut out; None without a cut or where none came with
+        it.
+        """
+        return self.geometry.tumour_cut_out
 
     @property
     def judgement(self) -> Judgement | None:
@@ -265,9 +293,12 @@ class DeformedAnatomy:
             return None
         surfaces = organ, cut.specimen, cut.remnant, tumour
         as_cut = Carried(*(self.carried_then(surface.vertices, resection) for surface in surfaces))
-        labels, tissues = self._labels
-        moved = labels and Grid(labels.voxels, labels.index_from_mm @ shift_by(self.case.origin))
-        return judge(cut, organ, tumour, self.case.parts, as_cut, moved, tissues)
+        return judge(cut, organ, tumour, self.case.parts, as_cut, self._moved_labels(), self._labels[1])
+
+    def _moved_labels(self) -> Grid | None:
+        """The labels, relative to the origin of the case."""
+        labels = self._labels[0]
+        return labels and Grid(labels.voxels, labels.index_from_mm @ shift_by(self.case.origin))
 
 
 class ScannedCt:
