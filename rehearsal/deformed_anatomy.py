@@ -4,6 +4,7 @@ It needs no solver: the frame carries its points.
 """
 
 from concurrent.futures import Future
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -14,6 +15,7 @@ from rehearsal.build_solver import embedding_cell_mm
 from rehearsal.case import Case
 from rehearsal.loop.frame import Frame, RestGeometry
 from rehearsal.resection.cut import Cut
+from rehearsal.resection.drawn_cut import DrawnCut, drawn_cut
 from rehearsal.resection.judgement import Carried, Judgement, judge
 from rehearsal.resection.resection_state import Resection, cut_of
 from rehearsal.resection.score_line import ResectionError
@@ -65,6 +67,7 @@ class DeformedAnatomy:
         self._judged: dict[Resection, tuple[Judgement | None, str]] = {}
         self._skins: dict[str, Skin] = {}
         self._fine: tuple[FineSurface, Skin] | None = None
+        self.drawn_remnant: DrawnCut | None = None
         self._version = -1
         image = case.scene.image
         margin = SURROUNDINGS_MM if shows_ct(image.outside) else 0.0
@@ -93,9 +96,12 @@ class DeformedAnatomy:
         if (tumour := geometry.tumour) is not None:
             self._skins["tumour"] = self.skin(tumour.vertices)
             self._skins["drawn tumour"] = self.skin(tumour.vertices + TUMOUR_LIFT_MM * tumour.vertex_normals)
+        self.drawn_remnant, cut = None, geometry.cut
+        if cut is not None:
+            self.drawn_remnant = drawn_cut(cut.remnant, cut.on_remnant)
+            self._skins["drawn organ"] = self.skin(self.drawn_remnant.vertices)
         self.embedding.skin.attach_again()
         if self.scanner is not None:
-            cut = geometry.cut
             crater = None if cut is None else Crater(cut.specimen, cut.settings.filling)
             self.scanner.volumes.set_crater(crater)
 
@@ -159,8 +165,10 @@ class DeformedAnatomy:
 
     @property
     def drawn_organ(self) -> Field:
-        """The organ's vertices (n,), which move with each frame of this version."""
-        return self._skins["organ"].vertices
+        """The vertices (n,) of the organ, after a cut those of ``drawn_remnant``, which move with each frame
+        of this version.
+        """
+        return self._skins["organ" if self.drawn_remnant is None else "drawn organ"].vertices
 
     @property
     def drawn_tumour(self) -> Field | None:
@@ -226,13 +234,14 @@ class DeformedAnatomy:
             raise ResectionError("nothing was cut yet")
         return self.geometry.whole.carried(np.asarray(points, float), request.nodes_mm)  # type: ignore[attr-defined]
 
-    def specimen_beside(self) -> np.ndarray:
-        """Vertices (n, 3) [mm] of the specimen as it was cut, beside the end of the organ that is nearer
-        to it. Raises ResectionError.
+    def specimen_beside(self) -> DrawnCut:
+        """The specimen as it was cut, beside the end of the organ that is nearer to it. Raises
+        ResectionError.
         """
         if self.cut is None:
             raise ResectionError("nothing was cut yet")
-        return self._beside(np.asarray(self.cut.specimen.vertices))
+        drawn = drawn_cut(self.cut.specimen, self.cut.on_specimen)
+        return replace(drawn, vertices=self._beside(drawn.vertices))
 
     def _beside(self, points: np.ndarray) -> np.ndarray:
         """Where points (n, 3) [mm] of the specimen at rest are, beside the organ. Raises ResectionError."""

@@ -11,7 +11,7 @@ import numpy as np
 from render import transducer_shape
 from render.camera import OrbitCamera
 from render.cut_face import CutFace, side_of_eye
-from render.surface_shading import CUT_EDGE_MM, GLASS, SOLID, Cut, DrawnMesh, ShadedSurface
+from render.surface_shading import CUT_EDGE_MM, GLASS, ORGAN, SOLID, Cut, DrawnMesh, ShadedSurface
 from render.viewer import Geometry, Guidance, Score, Surface, View, ViewSettings
 from sim.fields import field_of, fill, zeros
 
@@ -50,7 +50,10 @@ class SceneView:
 
     def __init__(self, geometry: Geometry, camera: OrbitCamera, before: "SceneView | None" = None):
         self.camera, self._up = camera, np.asarray(geometry.up, float)
-        self._organ = ShadedSurface(*geometry.organ)
+        self._organ = ShadedSurface(*geometry.organ, _colours_of_organ(geometry))
+        self._seen_vertices = geometry.seen_vertices
+        # The coverage that was drawn last, and that of the drawn vertices.
+        self._coverage: tuple[np.ndarray | None, np.ndarray | None] = None, None
         self._tumour = self._support = None
         self._parts = [
             ShadedSurface(*part, _colours_of(tissue, geometry)) for tissue, part in geometry.parts.items()
@@ -129,9 +132,17 @@ class SceneView:
             self._bed.shade(eye, key)
             self._bed.draw(scene)
         opacity = GLASS if shown.translucent else SOLID
-        self._organ.tint(view.seen.get("organ"))
+        self._organ.tint(self._covered(view.seen.get("organ")))
         self._organ.shade(eye, key, opacity, cut)
         self._organ.draw(scene, ahead if opacity < SOLID or cut is not None else None, cut)
+
+    def _covered(self, seen: np.ndarray | None) -> np.ndarray | None:
+        """Coverage of the drawn vertices of the organ."""
+        if seen is None or self._seen_vertices is None:
+            return seen
+        if seen is not self._coverage[0]:
+            self._coverage = seen, seen[self._seen_vertices]
+        return self._coverage[1]
 
     def _draw_specimen(self, scene, eye, key, ahead: np.ndarray) -> None:
         """Draw what was cut out, translucent, so that the tumour in it is seen."""
@@ -273,6 +284,15 @@ class ScoreLines:
         shades[:count] = np.repeat(colours, 2, axis=0)
         fill((self._points, points), (self._colours, shades))
         scene.lines(self._points, SCORE_WIDTH, per_vertex_color=self._colours)
+
+
+def _colours_of_organ(geometry: Geometry) -> np.ndarray:
+    """The colour (3,) of the organ, or after a cut those of its vertices (n, 3)."""
+    if geometry.bed is None:
+        return np.array(ORGAN)
+    colours = np.tile(ORGAN, (geometry.organ[0].shape[0], 1))
+    colours[geometry.bed[1]] = BED
+    return colours
 
 
 def _colours_of(tissue: str, geometry: Geometry) -> np.ndarray:

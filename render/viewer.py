@@ -124,6 +124,8 @@ class Geometry:
     """The tumour in the specimen. It does not move."""
     bed: Surface | None = None
     """The faces of the organ that a cut has made."""
+    seen_vertices: np.ndarray | None = None
+    """For each vertex of the organ its index in the coverage, shape (n,); None where they are the same."""
 
 
 @dataclass(frozen=True)
