@@ -257,7 +257,10 @@ class DeformedAnatomy:
     def tumour_beside(self) -> np.ndarray:
         """Vertices (n, 3) [mm] of ``tumour_in_specimen``, in the specimen beside the organ."""
         tumour = self.tumour_in_specimen
-        return np.zeros((0, 3)) if tumour is None else self._beside(np.asarray(tumour.vertices))
+        if tumour is None:
+            return np.zeros((0, 3))
+        # Where the tumour protrudes, specimen and tumour share a surface too.
+        return self._beside(tumour.vertices + TUMOUR_LIFT_MM * tumour.vertex_normals)
 
     @property
     def tumour_in_specimen(self) -> trimesh.Trimesh | None:

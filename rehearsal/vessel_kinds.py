@@ -23,3 +23,14 @@ def vessel_kinds(points: np.ndarray, labels: Grid | None, tissues: Mapping[int, 
     centres = at @ mm_from_index[:3, :3].T + mm_from_index[:3, 3]
     nearest = cKDTree(centres).query(points)[1]
     return np.array([tissues[int(value)] for value in labels.voxels[tuple(at[nearest].T)]], dtype=str)
+
+
+def unlabelled_in_words(kinds: np.ndarray | None) -> str:
+    """What the labels do not say of the vessels, of kinds (n,), None where there are none; empty where they
+    say all.
+    """
+    if kinds is None:
+        return "Vessels are not labelled: none are drawn in the kidney."
+    if (kinds == "vessel").any():
+        return "The labels do not say which vessels are arteries and which are veins: those are violet."
+    return ""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rehearsal.vessel_kinds import vessel_kinds
+from rehearsal.vessel_kinds import unlabelled_in_words, vessel_kinds
 from scenes.anatomy import Grid
 
 # Voxels of 2 mm, the first at (10, 0, 0) mm: an artery and a vein, side by side along z.
@@ -26,3 +26,9 @@ def test_a_vessel_is_neither_where_no_label_says_which():
     points = np.array([[13.0, 3.0, 4.0], [21.0, 3.0, 4.0]])
     assert vessel_kinds(points, labels(), {5: "vessel", 7: "vessel"}).tolist() == ["vessel", "vessel"]
     assert vessel_kinds(points, None, {}).tolist() == ["vessel", "vessel"]
+
+
+def test_the_window_names_what_no_label_says():
+    assert "not labelled" in unlabelled_in_words(None)
+    assert "violet" in unlabelled_in_words(np.array(["artery", "vessel"]))
+    assert unlabelled_in_words(np.array(["artery", "vein"])) == ""
