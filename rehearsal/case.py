@@ -52,12 +52,10 @@ class Case:
 
     @property
     def lateral(self) -> np.ndarray:
-        """Unit vector (3,) to the side of the patient that the kidney is on: away from its hilum, or where
-        the scene names none, from the midline of the CT's coordinates.
+        """Unit vector (3,) to the side of the patient that the kidney is on, as seen from the middle of the
+        scanner, in which patients lie: x = 0.
         """
-        hilum = self.scene.attachment.at_mm
-        medial = 0.0 if hilum is None else hilum[0]
-        return np.array([np.copysign(1.0, self.origin[0] - medial), 0.0, 0.0])
+        return np.array([np.copysign(1.0, self.origin[0]), 0.0, 0.0])
 
     @property
     def size_mm(self) -> np.ndarray:

@@ -46,8 +46,8 @@ from rehearsal.sources.tracker import Tracker, played_pose
 from rehearsal.sources.user import UserSource
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer
 from rehearsal.tracking.pose_file import TimedPoses
-from rehearsal.window_loop import WindowLoop
 from rehearsal.vessel_kinds import unlabelled_in_words
+from rehearsal.window_loop import WindowLoop
 from rehearsal.window_panel import WindowPanel
 from render.window import Window
 from scenes.anatomy import LoadedAnatomy

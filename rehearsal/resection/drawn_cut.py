@@ -39,12 +39,15 @@ def drawn_cut(surface: trimesh.Trimesh, on_cut: np.ndarray) -> DrawnCut:
     start, _ = trimesh.remesh.subdivide(smooth, cut)
     # The rim stays where it is also for the capsule, whose edges are not divided.
     fine_smooth = _smoothed(start, fine, divided, is_rim_free=False)
-    used, own = np.unique(divided, return_inverse=True)
-    vertices = np.concatenate([smooth, fine_smooth[used]])
-    drawn = np.concatenate([faces[~on_cut], own.reshape(-1, 3) + len(rest)])
-    is_cut = np.arange(len(drawn)) >= (~on_cut).sum()
-    source = np.concatenate([np.arange(len(rest)), cKDTree(rest).query(fine[used])[1]])
-    return DrawnCut(vertices, drawn, is_cut, source)
+    of_capsule, capsule = np.unique(faces[~on_cut], return_inverse=True)
+    of_cut, own = np.unique(divided, return_inverse=True)
+    drawn = np.concatenate([capsule.reshape(-1, 3), own.reshape(-1, 3) + len(of_capsule)])
+    return DrawnCut(
+        vertices=np.concatenate([smooth[of_capsule], fine_smooth[of_cut]]),
+        faces=drawn,
+        on_cut=np.arange(len(drawn)) >= len(capsule.reshape(-1, 3)),
+        source=np.concatenate([of_capsule, cKDTree(rest).query(fine[of_cut])[1]]),
+    )
 
 
 def _smoothed(start: np.ndarray, rest: np.ndarray, faces: np.ndarray, is_rim_free: bool) -> np.ndarray:

@@ -570,7 +570,7 @@ def test_other_geometry_has_its_own_sliders(window):
 
 
 @pytest.mark.parametrize("translucent", [False, True])
-def test_the_bed_of_a_cut_is_solid_in_a_translucent_organ(window, translucent):
+def test_the_bed_of_a_cut_has_its_own_colour(window, translucent):
     opened, field, _ = window
     faces = opened._geometry.organ[1]
     change(opened, "view.translucent", translucent)
@@ -578,7 +578,8 @@ def test_the_bed_of_a_cut_is_solid_in_a_translucent_organ(window, translucent):
     before = opened.picture().astype(int)
     opened.change_geometry(dataclasses.replace(opened._geometry, bed=(field, faces[: len(faces) // 2])))
     brighter = (opened.picture() - before).max(axis=2) > 20
-    assert brighter[opened.layout.clear.slices].any() == translucent
+    # Also in a translucent organ, where the organ itself is dark.
+    assert brighter[opened.layout.clear.slices].any()
 
 
 @pytest.mark.parametrize(
