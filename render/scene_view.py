@@ -62,6 +62,8 @@ class SceneView:
             self._tumour = ShadedSurface(*geometry.tumour, TUMOUR)
         self._specimen = _still(geometry.specimen, SPECIMEN)
         self._tumour_cut_out = _still(geometry.tumour_cut_out, TUMOUR)
+        # The eye that saw them last, and the order of the specimen's faces for it.
+        self._specimen_eye, self._specimen_order = np.full(3, np.nan), np.zeros(0, np.int32)
         self._bed = None if geometry.bed is None else ShadedSurface(*geometry.bed, BED)
         if geometry.support is not None:
             self._support = self._matt_support(*geometry.support)
@@ -146,12 +148,20 @@ class SceneView:
 
     def _draw_specimen(self, scene, eye, key, ahead: np.ndarray) -> None:
         """Draw what was cut out, translucent, so that the tumour in it is seen."""
+        # It does not move: its shades and the order of its faces are those of the camera.
+        if not np.array_equal(eye, self._specimen_eye):
+            self._specimen_eye = eye
+            for surface, opacity in ((self._tumour_cut_out, SOLID), (self._specimen, GLASS)):
+                if surface is not None:
+                    surface.shade(eye, key, opacity)
+            if self._specimen is not None:
+                self._specimen_order = self._specimen.indices(ahead)
         if self._tumour_cut_out is not None:
-            self._tumour_cut_out.shade(eye, key)
             self._tumour_cut_out.draw(scene)
-        if self._specimen is not None:
-            self._specimen.shade(eye, key, GLASS)
-            self._specimen.draw(scene, ahead)
+        if (specimen := self._specimen) is not None:
+            scene.mesh(
+                specimen.vertices, self._specimen_order, specimen.normal, per_vertex_color=specimen.colour
+            )
 
     def _inner(self, view: View, shown: ViewSettings) -> list[ShadedSurface]:
         """The shown surfaces inside the organ."""

@@ -705,3 +705,23 @@ def test_a_window_fits_its_screen(screen, size):
 )
 def test_the_scale_is_that_of_the_desktop(resources, scale):
     assert scale_of(resources) == scale
+
+
+def test_the_tumour_is_seen_in_the_specimen_from_all_sides(window):
+    opened, field, _ = window
+    fill_evenly(field, 0.0)
+    around, inner = (trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (12.0, 6.0))
+    change(opened, "view.translucent", False)
+    seen = []
+    for cut_out in (None, (inner.vertices.astype(np.float32), inner.faces.astype(np.int32))):
+        specimen = around.vertices.astype(np.float32), around.faces.astype(np.int32)
+        new = dataclasses.replace(opened._geometry, specimen=specimen, tumour_cut_out=cut_out)
+        opened.change_geometry(new)
+        opened.camera.go_home()
+        opened.draw(_far_view())
+        first = opened.picture().astype(int)
+        opened.camera.orbit(0.4, 0.1)
+        seen.append((first, opened.picture().astype(int)))
+    for without, with_tumour in zip(*seen, strict=True):
+        # Gold has more green than the specimen.
+        assert (with_tumour - without)[..., 1].max() > 20
