@@ -51,6 +51,13 @@ class Case:
         return direction / np.linalg.norm(direction)
 
     @property
+    def lateral(self) -> np.ndarray:
+        """Unit vector (3,) to the side of the patient that the kidney is on, as seen from the middle of the
+        scanner, in which patients lie: x = 0.
+        """
+        return np.array([np.copysign(1.0, self.origin[0]), 0.0, 0.0])
+
+    @property
     def size_mm(self) -> np.ndarray:
         """The transducer's size (3,)."""
         return np.array(self.probe.housing_mm)

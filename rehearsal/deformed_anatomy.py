@@ -4,6 +4,7 @@ It needs no solver: the frame carries its points.
 """
 
 from concurrent.futures import Future
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -14,10 +15,12 @@ from rehearsal.build_solver import embedding_cell_mm
 from rehearsal.case import Case
 from rehearsal.loop.frame import Frame, RestGeometry
 from rehearsal.resection.cut import Cut
+from rehearsal.resection.drawn_cut import DrawnCut, drawn_cut
 from rehearsal.resection.judgement import Carried, Judgement, judge
 from rehearsal.resection.resection_state import Resection, cut_of
 from rehearsal.resection.score_line import ResectionError
 from rehearsal.tissue_voxels import tissue_voxels
+from rehearsal.vessel_kinds import vessel_kinds
 from scenes.anatomy import Grid, LoadedAnatomy
 from scenes.surfaces import FineSurface, translated, volume_mm3
 from sim.embedding import Embedding
@@ -64,6 +67,7 @@ class DeformedAnatomy:
         self._judged: dict[Resection, tuple[Judgement | None, str]] = {}
         self._skins: dict[str, Skin] = {}
         self._fine: tuple[FineSurface, Skin] | None = None
+        self.drawn_remnant: DrawnCut | None = None
         self._version = -1
         image = case.scene.image
         margin = SURROUNDINGS_MM if shows_ct(image.outside) else 0.0
@@ -92,9 +96,12 @@ class DeformedAnatomy:
         if (tumour := geometry.tumour) is not None:
             self._skins["tumour"] = self.skin(tumour.vertices)
             self._skins["drawn tumour"] = self.skin(tumour.vertices + TUMOUR_LIFT_MM * tumour.vertex_normals)
+        self.drawn_remnant, cut = None, geometry.cut
+        if cut is not None:
+            self.drawn_remnant = drawn_cut(cut.remnant, cut.on_remnant)
+            self._skins["drawn organ"] = self.skin(self.drawn_remnant.vertices)
         self.embedding.skin.attach_again()
         if self.scanner is not None:
-            cut = geometry.cut
             crater = None if cut is None else Crater(cut.specimen, cut.settings.filling)
             self.scanner.volumes.set_crater(crater)
 
@@ -158,8 +165,10 @@ class DeformedAnatomy:
 
     @property
     def drawn_organ(self) -> Field:
-        """The organ's vertices (n,), which move with each frame of this version."""
-        return self._skins["organ"].vertices
+        """The vertices (n,) of the organ, after a cut those of ``drawn_remnant``, which move with each frame
+        of this version.
+        """
+        return self._skins["organ" if self.drawn_remnant is None else "drawn organ"].vertices
 
     @property
     def drawn_tumour(self) -> Field | None:
@@ -170,6 +179,15 @@ class DeformedAnatomy:
     def drawn_parts(self) -> dict[str, Field]:
         """The vertices (n,) of other parts, by tissue."""
         return {name: self._skins[f"part {name}"].vertices for name in self.geometry.parts}
+
+    def vessel_kinds(self) -> np.ndarray | None:
+        """Artery, vein, or vessel where no label says which, of the vertices (n,) of the vessels; None
+        without any.
+        """
+        vessels = self.geometry.parts.get("vessel")
+        if vessels is None:
+            return None
+        return vessel_kinds(vessels.vertices, self._moved_labels(), self._labels[1])
 
     def find_plane(self, probe: Probe) -> None:
         """Locate the image plane in the tissue without computing an image."""
@@ -216,18 +234,40 @@ class DeformedAnatomy:
             raise ResectionError("nothing was cut yet")
         return self.geometry.whole.carried(np.asarray(points, float), request.nodes_mm)  # type: ignore[attr-defined]
 
-    def specimen_beside(self) -> np.ndarray:
-        """Vertices (n, 3) [mm] of the specimen as it was cut, beside the end of the organ that is nearer
-        to it. Raises ResectionError.
+    def specimen_beside(self) -> DrawnCut:
+        """The specimen as it was cut, beside the end of the organ that is nearer to it. Raises
+        ResectionError.
         """
         if self.cut is None:
             raise ResectionError("nothing was cut yet")
-        vertices = self.carried_then(self.cut.specimen.vertices)
+        drawn = drawn_cut(self.cut.specimen, self.cut.on_specimen)
+        return replace(drawn, vertices=self._beside(drawn.vertices))
+
+    def _beside(self, points: np.ndarray) -> np.ndarray:
+        """Where points (n, 3) [mm] of the specimen at rest are, beside the organ. Raises ResectionError."""
+        if self.cut is None:
+            raise ResectionError("nothing was cut yet")
+        specimen = self.carried_then(self.cut.specimen.vertices)
         long_axis = np.array(self.case.press.lateral)
-        organ, own = np.asarray(self.case.organ.vertices) @ long_axis, vertices @ long_axis
+        organ, own = np.asarray(self.case.organ.vertices) @ long_axis, specimen @ long_axis
         side = 1.0 if own.mean() >= organ.mean() else -1.0
         reach = (side * organ).max() - (side * own).min()
-        return vertices + side * (reach + BESIDE_MM) * long_axis
+        return self.carried_then(points) + side * (reach + BESIDE_MM) * long_axis
+
+    def tumour_beside(self) -> np.ndarray:
+        """Vertices (n, 3) [mm] of ``tumour_in_specimen``, in the specimen beside the organ."""
+        tumour = self.tumour_in_specimen
+        if tumour is None:
+            return np.zeros((0, 3))
+        # Where the tumour protrudes, specimen and tumour share a surface too.
+        return self._beside(tumour.vertices + TUMOUR_LIFT_MM * tumour.vertex_normals)
+
+    @property
+    def tumour_in_specimen(self) -> trimesh.Trimesh | None:
+        """The surface at rest of the tumour that was cut out; None without a cut or where none came with
+        it.
+        """
+        return self.geometry.tumour_cut_out
 
     @property
     def judgement(self) -> Judgement | None:
@@ -265,9 +305,12 @@ class DeformedAnatomy:
             return None
         surfaces = organ, cut.specimen, cut.remnant, tumour
         as_cut = Carried(*(self.carried_then(surface.vertices, resection) for surface in surfaces))
-        labels, tissues = self._labels
-        moved = labels and Grid(labels.voxels, labels.index_from_mm @ shift_by(self.case.origin))
-        return judge(cut, organ, tumour, self.case.parts, as_cut, moved, tissues)
+        return judge(cut, organ, tumour, self.case.parts, as_cut, self._moved_labels(), self._labels[1])
+
+    def _moved_labels(self) -> Grid | None:
+        """The labels, relative to the origin of the case."""
+        labels = self._labels[0]
+        return labels and Grid(labels.voxels, labels.index_from_mm @ shift_by(self.case.origin))
 
 
 class ScannedCt:

@@ -26,25 +26,31 @@ def drawn_geometry(anatomy: DeformedAnatomy) -> Geometry:
         fixed = anatomy.supports[0]
         support = np.asarray(fixed.vertices, np.float32), np.asarray(fixed.faces, np.int32)
     faces = np.asarray(anatomy.organ.faces, np.int32)
-    specimen = bed = None
-    if anatomy.cut is not None:
-        bed = anatomy.drawn_organ, faces[anatomy.cut.on_remnant]
-        specimen = (
-            anatomy.specimen_beside().astype(np.float32),
-            np.asarray(anatomy.cut.specimen.faces, np.int32),
-        )
+    specimen = bed = cut_out = source = None
+    if (remnant := anatomy.drawn_remnant) is not None:
+        faces, source = np.asarray(remnant.faces, np.int32), remnant.source
+        bed = anatomy.drawn_organ, faces[remnant.on_cut]
+        beside = anatomy.specimen_beside()
+        specimen = beside.vertices.astype(np.float32), np.asarray(beside.faces, np.int32)
+        if anatomy.tumour_in_specimen is not None:
+            triangles = np.asarray(anatomy.tumour_in_specimen.faces, np.int32)
+            cut_out = anatomy.tumour_beside().astype(np.float32), triangles
     return Geometry(
         organ=(anatomy.drawn_organ, faces),
+        seen_vertices=source,
         bounds=case.organ.bounds,
         up=-case.gravity_direction,
+        lateral=case.lateral,
         transducer=drawn_housing(case.probe),
         tumour=tumour,
         parts={
             tissue: (vertices, np.asarray(anatomy.geometry.parts[tissue].faces, np.int32))
             for tissue, vertices in anatomy.drawn_parts.items()
         },
+        vessel_kinds=anatomy.vessel_kinds(),
         support=support,
         specimen=specimen,
+        tumour_cut_out=cut_out,
         bed=bed,
     )
 

@@ -46,6 +46,7 @@ from rehearsal.sources.tracker import Tracker, played_pose
 from rehearsal.sources.user import UserSource
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer
 from rehearsal.tracking.pose_file import TimedPoses
+from rehearsal.vessel_kinds import unlabelled_in_words
 from rehearsal.window_loop import WindowLoop
 from rehearsal.window_panel import WindowPanel
 from render.window import Window
@@ -122,6 +123,7 @@ class RehearsalRun:
             f"{{quit}} quits."
         )
         click.echo(self.files.keys.worded(text))
+        self.notices.post(unlabelled_in_words(self.anatomy.vessel_kinds()), in_terminal=False)
         announcements = Announcements(self.anatomy, self.notices)
         plans = PlanControl(self.anatomy.case, self.loaded, self.measurements, self.options.out, self.notices)
         observers = self._observers(announcements, check)

@@ -23,6 +23,7 @@ class OrbitCamera:
     def __init__(self, bounds, up, part, aspect: float):
         bounds = np.asarray(bounds, dtype=np.float64)
         self.up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+        self._up_home = self.up
         self._middle = bounds.mean(axis=0)
         self.aspect = aspect
         self.part = part
@@ -32,7 +33,7 @@ class OrbitCamera:
         flat = np.eye(3) - np.outer(self.up, self.up)
         spread = (bounds[1] - bounds[0]) * np.linalg.norm(flat, axis=1)
         side = flat[int(np.argmax(spread))]
-        self._side = side / np.linalg.norm(side)
+        self._side = self._side_home = side / np.linalg.norm(side)
         self._ahead = np.cross(self.up, self._side)
         self.distance = self.distance_home = self._framing_distance(bounds)
 
@@ -46,6 +47,23 @@ class OrbitCamera:
         self.target = self._middle
         self.azimuth_deg, self.elevation_deg = HOME_DEG
         self.distance = self.distance_home
+
+    def look(self, ahead: np.ndarray, up: np.ndarray) -> None:
+        """Look along a direction (3,) at the organ, with another (3,), not parallel to it, upwards."""
+        self.target, self.distance = self._middle, self.distance_home
+        self.up = up / np.linalg.norm(up)
+        along = ahead / np.linalg.norm(ahead)
+        level = along - (along @ self.up) * self.up
+        self._ahead = level / np.linalg.norm(level)
+        self._side = np.cross(self._ahead, self.up)
+        self.azimuth_deg = 0.0
+        self.elevation_deg = float(np.degrees(np.arcsin(-along @ self.up)))
+
+    def look_from_home(self) -> None:
+        """Return to the initial view, also from ``look``."""
+        self.up, self._side = self._up_home, self._side_home
+        self._ahead = np.cross(self.up, self._side)
+        self.go_home()
 
     def _framing_distance(self, bounds: np.ndarray) -> float:
         right, up, ahead = self.axes()

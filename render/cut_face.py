@@ -108,12 +108,13 @@ class CutFace:
         ]
         raster = Raster.around(cuts, CELLS)
         covered = [raster.covered(cut).reshape(-1, 1) for cut in cuts]
-        colour = np.tile(FLESH, (CELLS**2, 1))
-        for share, surface in zip(covered[1:], inner, strict=True):
-            colour += share * (np.array(surface.base) - colour)
-        most = np.max(covered, axis=0)
         places = raster.places()
         points = pose[:3, 3] + places @ pose[:3, [0, 2]].T
+        colour = np.tile(FLESH, (CELLS**2, 1))
+        for share, surface in zip(covered[1:], inner, strict=True):
+            here = share[:, 0] > 0
+            colour[here] += share[here] * (surface.base_near(points[here]) - colour[here])
+        most = np.max(covered, axis=0)
         toward = key - points.mean(axis=0)
         normals = np.tile(toward / np.linalg.norm(toward), (len(points), 1))
         # Not clamped: blending clamps each pixel.

@@ -10,7 +10,7 @@ from render.text import font, wrapped
 from render.ultrasound_panel import ALERT, LINE, QUIET, TEXT
 from render.window_layout import MESSAGE_LINES, MESSAGE_PITCH, WindowLayout
 
-LETTERS_PX, LEAST_PX, PAGE_PX, BESIDE_PX = 15, 11, 15, 12
+LETTERS_PX, LEAST_PX, LEAST_SMALL_PX, PAGE_PX, BESIDE_PX = 15, 14, 11, 15, 12
 STRIP, PAGE = (17, 20, 24), (22, 26, 31)
 TITLE, EMPTY = "Messages of this session, the newest first", "There were none yet."
 
@@ -21,11 +21,13 @@ def message_lines(layout: WindowLayout, messages: tuple[str, ...]) -> tuple[list
     what is longer still the last lines are left out.
     """
     room, lines = layout.messages.width - 2 * layout.px(BESIDE_PX), list[str]()
-    for size in range(LETTERS_PX, LEAST_PX - 1, -1):
+    # A window that is smaller than FULL_SIZE has no room for larger letters.
+    least = LEAST_PX if layout.scale >= 1 else LEAST_SMALL_PX
+    for size in range(LETTERS_PX, least - 1, -1):
         lines = [line for text in messages for line in wrapped(text, layout.px(size), room)]
         if len(lines) <= MESSAGE_LINES:
             return lines, layout.px(size)
-    return [*lines[: MESSAGE_LINES - 1], lines[MESSAGE_LINES - 1] + " ..."], layout.px(LEAST_PX)
+    return [*lines[: MESSAGE_LINES - 1], lines[MESSAGE_LINES - 1] + " ..."], layout.px(least)
 
 
 def message_image(layout: WindowLayout, messages: tuple[str, ...], hint: str = "") -> np.ndarray:

@@ -22,6 +22,7 @@ TOOLS: dict[Phase, tuple[dict[str, str], ...]] = {
             "toe": "rock_right",
             "Tilt back": "tilt_back",
             "forward": "tilt_forward",
+            "View": "approach",
         },
         {
             "Freeze": "freeze",
@@ -40,6 +41,7 @@ TOOLS: dict[Phase, tuple[dict[str, str], ...]] = {
             "Planned line": "score_planned",
             "Undo": "undo",
             "Redo": "redo",
+            "View": "approach",
         },
         {
             "Technique": "technique",
@@ -49,7 +51,7 @@ TOOLS: dict[Phase, tuple[dict[str, str], ...]] = {
         },
     ),
     "Excise": (
-        {"Cut along the line": "cut_out", "Undo": "undo", "Redo": "redo"},
+        {"Cut along the line": "cut_out", "Undo": "undo", "Redo": "redo", "View": "approach"},
         {"Technique": "technique", "Margin and depth": "show_resection", "Outline": "outline"},
     ),
     "Inspect": (
@@ -59,7 +61,14 @@ TOOLS: dict[Phase, tuple[dict[str, str], ...]] = {
             "Cut open": "cut",
             "Translucent": "translucent",
         },
-        {"Undo": "undo", "Redo": "redo", "Save": "export", "Screenshot": "screenshot", "Messages": "log"},
+        {
+            "View": "approach",
+            "Undo": "undo",
+            "Redo": "redo",
+            "Save": "export",
+            "Screenshot": "screenshot",
+            "Messages": "log",
+        },
     ),
 }
 
@@ -94,12 +103,16 @@ def tools_of(layout: WindowLayout, settings: WindowSettings, keys: Keys) -> list
     tools: list[Tool] = []
     for number, row in enumerate(rows):
         left, room = layout.px(GAP_PX), layout.tool_row(number)
-        for label, action in row.items():
+        for bare, action in row.items():
             if action not in keys.of:
                 continue
             value = values.get(action)
-            label = _with_value(label, value)
-            width = _width(layout, label) + _width(layout, keys.of[action]) + layout.px(3 * GAP_PX)
+            label = _with_value(bare, value)
+            width = _tool_width(layout, label, keys.of[action])
+            if left + width > room.right:
+                # Without the value it may fit.
+                label = bare
+                width = _tool_width(layout, label, keys.of[action])
             if left + width > room.right:
                 break
             box = Rect(left, room.top, width, room.height)
@@ -111,6 +124,10 @@ def tools_of(layout: WindowLayout, settings: WindowSettings, keys: Keys) -> list
 def _with_value(label: str, value: Any) -> str:
     """A label with the value of a setting that has several in words."""
     return f"{label}: {value}" if isinstance(value, str) else label
+
+
+def _tool_width(layout: WindowLayout, label: str, key: str) -> int:
+    return _width(layout, label) + _width(layout, key) + layout.px(3 * GAP_PX)
 
 
 def _width(layout: WindowLayout, text: str) -> int:

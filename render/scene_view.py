@@ -11,14 +11,21 @@ import numpy as np
 from render import transducer_shape
 from render.camera import OrbitCamera
 from render.cut_face import CutFace, side_of_eye
-from render.surface_shading import CUT_EDGE_MM, GLASS, SOLID, Cut, DrawnMesh, ShadedSurface
-from render.viewer import Geometry, Guidance, Score, View, ViewSettings
+from render.surface_shading import CUT_EDGE_MM, GLASS, ORGAN, SOLID, Cut, DrawnMesh, ShadedSurface
+from render.viewer import Geometry, Guidance, Score, Surface, View, ViewSettings
 from sim.fields import field_of, fill, zeros
 
 PLANE_ROWS, PLANE_COLUMNS = 96, 64
 KEY_LIGHT, FILL_LIGHT, AMBIENT = (0.82, 0.80, 0.77), (0.17, 0.19, 0.23), (0.17, 0.17, 0.19)
 TUMOUR, SUPPORT, EDGE, FRAME = (0.93, 0.76, 0.28), (0.30, 0.33, 0.36), (0.85, 0.9, 0.94), (0.25, 0.77, 1.0)
-PARTS = {"cyst": (0.30, 0.60, 0.86), "urine": (0.61, 0.74, 0.38), "vessel": (0.76, 0.16, 0.06)}
+# As in an atlas; a vessel is neither red nor blue where no label says whether it is artery or vein.
+PARTS = {
+    "cyst": (0.55, 0.80, 0.95),
+    "urine": (0.92, 0.94, 0.55),
+    "artery": (0.86, 0.10, 0.08),
+    "vein": (0.14, 0.26, 0.80),
+    "vessel": (0.56, 0.30, 0.66),
+}
 LINE_WIDTH = 1.2
 # Panel, title, strip, compass, findings, warnings.
 MASKS = 6
@@ -42,16 +49,21 @@ class SceneView:
     """
 
     def __init__(self, geometry: Geometry, camera: OrbitCamera, before: "SceneView | None" = None):
-        self.camera = camera
-        self._organ = ShadedSurface(*geometry.organ)
+        self.camera, self._up = camera, np.asarray(geometry.up, float)
+        self._organ = ShadedSurface(*geometry.organ, _colours_of_organ(geometry))
+        self._seen_vertices = geometry.seen_vertices
+        # The coverage that was drawn last, and that of the drawn vertices.
+        self._coverage: tuple[np.ndarray | None, np.ndarray | None] = None, None
         self._tumour = self._support = None
-        self._parts = [ShadedSurface(*part, PARTS[tissue]) for tissue, part in geometry.parts.items()]
+        self._parts = [
+            ShadedSurface(*part, _colours_of(tissue, geometry)) for tissue, part in geometry.parts.items()
+        ]
         if geometry.tumour is not None:
             self._tumour = ShadedSurface(*geometry.tumour, TUMOUR)
-        self._specimen = None
-        if geometry.specimen is not None:
-            vertices, faces = geometry.specimen
-            self._specimen = ShadedSurface(field_of(vertices, within=1), faces, SPECIMEN)
+        self._specimen = _still(geometry.specimen, SPECIMEN)
+        self._tumour_cut_out = _still(geometry.tumour_cut_out, TUMOUR)
+        # The eye that saw them last, and the order of the specimen's faces for it.
+        self._specimen_eye, self._specimen_order = np.full(3, np.nan), np.zeros(0, np.int32)
         self._bed = None if geometry.bed is None else ShadedSurface(*geometry.bed, BED)
         if geometry.support is not None:
             self._support = self._matt_support(*geometry.support)
@@ -74,7 +86,7 @@ class SceneView:
     def _matt_support(self, vertices: np.ndarray, faces: np.ndarray) -> ShadedSurface:
         support = ShadedSurface(field_of(vertices, within=1), faces, SUPPORT, gloss=0.0)
         # It is fixed and matt, so its colours are computed once, as seen from far above.
-        above = self.camera.target + 10.0 * self.camera.distance_home * self.camera.up
+        above = self.camera.target + 10.0 * self.camera.distance_home * self._up
         support.shade(above, above)
         return support
 
@@ -93,12 +105,12 @@ class SceneView:
         scene.point_light((eye + distance * (0.9 * right - 0.2 * up)).tolist(), FILL_LIGHT)
         if masked:
             self._mask(scene, masked)
-        if self._support is not None and shown.show_support:
+        # From beneath, it would hide the organ.
+        is_above = -ahead @ self._up > 0
+        if self._support is not None and shown.show_support and is_above:
             # A decimated mesh has slivers that face the wrong way, which would appear as black specks.
             self._support.draw(scene, two_sided=True)
-        if self._specimen is not None:
-            self._specimen.shade(eye, key)
-            self._specimen.draw(scene)
+        self._draw_specimen(scene, eye, key, ahead)
         self._draw_transducer(scene, view.transducer_pose)
         if view.hand_pose is not None:
             fill((self._ghost_points, transducer_shape.placed(self._probe_edges, view.hand_pose)))
@@ -122,9 +134,34 @@ class SceneView:
             self._bed.shade(eye, key)
             self._bed.draw(scene)
         opacity = GLASS if shown.translucent else SOLID
-        self._organ.tint(view.seen.get("organ"))
+        self._organ.tint(self._covered(view.seen.get("organ")))
         self._organ.shade(eye, key, opacity, cut)
         self._organ.draw(scene, ahead if opacity < SOLID or cut is not None else None, cut)
+
+    def _covered(self, seen: np.ndarray | None) -> np.ndarray | None:
+        """Coverage of the drawn vertices of the organ."""
+        if seen is None or self._seen_vertices is None:
+            return seen
+        if seen is not self._coverage[0]:
+            self._coverage = seen, seen[self._seen_vertices]
+        return self._coverage[1]
+
+    def _draw_specimen(self, scene, eye, key, ahead: np.ndarray) -> None:
+        """Draw what was cut out, translucent, so that the tumour in it is seen."""
+        # It does not move: its shades and the order of its faces are those of the camera.
+        if not np.array_equal(eye, self._specimen_eye):
+            self._specimen_eye = eye
+            for surface, opacity in ((self._tumour_cut_out, SOLID), (self._specimen, GLASS)):
+                if surface is not None:
+                    surface.shade(eye, key, opacity)
+            if self._specimen is not None:
+                self._specimen_order = self._specimen.indices(ahead)
+        if self._tumour_cut_out is not None:
+            self._tumour_cut_out.draw(scene)
+        if (specimen := self._specimen) is not None:
+            scene.mesh(
+                specimen.vertices, self._specimen_order, specimen.normal, per_vertex_color=specimen.colour
+            )
 
     def _inner(self, view: View, shown: ViewSettings) -> list[ShadedSurface]:
         """The shown surfaces inside the organ."""
@@ -257,6 +294,27 @@ class ScoreLines:
         shades[:count] = np.repeat(colours, 2, axis=0)
         fill((self._points, points), (self._colours, shades))
         scene.lines(self._points, SCORE_WIDTH, per_vertex_color=self._colours)
+
+
+def _colours_of_organ(geometry: Geometry) -> np.ndarray:
+    """The colour (3,) of the organ, or after a cut those of its vertices (n, 3)."""
+    if geometry.bed is None:
+        return np.array(ORGAN)
+    colours = np.tile(ORGAN, (geometry.organ[0].shape[0], 1))
+    colours[geometry.bed[1]] = BED
+    return colours
+
+
+def _colours_of(tissue: str, geometry: Geometry) -> np.ndarray:
+    """The colour (3,) of a part, or of the vessels those of their vertices (n, 3)."""
+    if tissue != "vessel" or geometry.vessel_kinds is None:
+        return np.array(PARTS[tissue])
+    return np.array([PARTS[str(kind)] for kind in geometry.vessel_kinds])
+
+
+def _still(surface: Surface | None, colour: tuple[float, float, float]) -> ShadedSurface | None:
+    """A surface that does not move, if there is one."""
+    return None if surface is None else ShadedSurface(field_of(surface[0], within=1), surface[1], colour)
 
 
 def thinned(line: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import igl
 import numpy as np
 import taichi as ti
 import taichi.math as tm
+from scipy.spatial import cKDTree
 
 from sim.fields import array_of, field_of, fields_of, fill, fill_evenly, zeros
 from sim.kernels import kernel
@@ -43,14 +44,17 @@ class ShadedSurface:
     """Normals and colours of one triangle mesh whose vertices move.
 
     ``vertices`` is a field (n,) of 3-vectors [mm]; ``faces`` (m, 3), int32, have their normals outward.
-    ``base`` is red, green and blue in [0, 1]; ``gloss`` is the strength of the sheen, 0 of a matt surface.
+    ``base`` is red, green and blue in [0, 1], (3,), or of each vertex (n, 3); ``gloss`` is the strength of
+    the sheen, 0 of a matt surface.
     """
 
     def __init__(self, vertices, faces: np.ndarray, base=ORGAN, gloss: float = 0.30):
         self.vertices = vertices
         self.faces = np.ascontiguousarray(faces, dtype=np.int32)
-        self.base, self.gloss = base, gloss
         count = vertices.shape[0]
+        self.gloss = gloss
+        self.base = np.broadcast_to(np.asarray(base, np.float32), (count, 3))
+        self._base = field_of(self.base, within=1)
         around, start = igl.vertex_triangle_adjacency(self.faces, count)
         self.normal, self.colour = zeros(count, 3, within=1), zeros(count, 4, within=1)
         self._tint = zeros(count)
@@ -60,18 +64,23 @@ class ShadedSurface:
 
     def shade(self, eye, light, opacity: float = SOLID, cut: Cut | None = None) -> None:
         """Update normals and colours. A cut surface is solid."""
-        places = eye, light, *(cut if cut is not None else np.zeros((2, 3))), self.base
+        places = eye, light, *(cut if cut is not None else np.zeros((2, 3)))
         self._shade(np.array(places, np.float32), float(opacity))
 
     @kernel
     def _shade(self, places: Points, opacity: float):
-        """``places`` (5,) are the eye, the light, a point of the cut and its normal, and the surface's
-        colour.
+        """``places`` (4,) are the eye, the light, a point of the cut and its normal.
 
         A zero normal cuts nothing; else what is on its side of the plane is transparent.
         """
         for v in range(self.vertices.shape[0]):
-            eye, light, cut_point, cut_normal, base = places[0], places[1], places[2], places[3], places[4]
+            eye, light, cut_point, cut_normal, base = (
+                places[0],
+                places[1],
+                places[2],
+                places[3],
+                self._base[v],
+            )
             vertex = self.vertices[v]
             total = tm.vec3(0.0)
             for k in range(self._start[v], self._start[v + 1]):
@@ -91,6 +100,12 @@ class ShadedSurface:
                 alpha = 0.5 - (vertex - cut_point).dot(cut_normal) / CUT_EDGE_MM
             tinted = base + self._tint[v] * (tm.vec3(TINT) - base)
             self.colour[v] = tm.vec4(tinted * (1.0 - 0.25 * rim) + sheen, alpha)
+
+    def base_near(self, points: np.ndarray) -> np.ndarray:
+        """The colours (k, 3) of the vertices that are nearest to points (k, 3) [mm]."""
+        if (self.base == self.base[:1]).all():
+            return np.broadcast_to(self.base[0], (len(points), 3))
+        return self.base[cKDTree(array_of(self.vertices)).query(points)[1]]
 
     def tint(self, vertices: np.ndarray | None) -> None:
         """Set which vertices (n,) bool are shown in TINT; None for none of them."""

@@ -13,7 +13,8 @@ import trimesh
 
 from render.viewer import TransducerHousing, View
 
-BODY, LENS, MARKER = (0.60, 0.65, 0.70), (0.16, 0.18, 0.21), (0.25, 0.77, 1.0)
+# The lens over the array, which touches the tissue, is seen as such.
+BODY, LENS, MARKER = (0.60, 0.65, 0.70), (0.10, 0.36, 0.42), (0.25, 0.77, 1.0)
 FIN, CABLE = (0.45, 0.50, 0.55), (0.24, 0.26, 0.30)
 LENS_MM = 2.5
 FRAME_SIDES = 48

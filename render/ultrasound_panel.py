@@ -178,7 +178,7 @@ def _draw_ruler(draw: ImageDraw.ImageDraw, layout: WindowLayout, view: View, box
         if centimetres and centimetres % every == 0:
             draw.text((x - px(15), row), str(centimetres), font=font(px(14)), fill=TEXT, anchor="rm")
         elif centimetres == 0:
-            draw.text((x - px(15), row), "cm", font=font(px(13)), fill=QUIET, anchor="rm")
+            draw.text((x - px(15), row), "cm", font=font(px(14)), fill=QUIET, anchor="rm")
     if view.focus_mm is not None:
         row = to_pixels(view, box, np.array([0.0, view.focus_mm]))[1]
         draw.polygon([(x + px(4), row), (x - px(4), row - px(5)), (x - px(4), row + px(5))], fill=ALERT)
@@ -198,7 +198,7 @@ def _draw_scale(draw: ImageDraw.ImageDraw, layout: WindowLayout, view: View, box
         draw.text(
             (box.right + px(WEDGE_WIDTH) - px(4), row),
             text,
-            font=font(px(12)),
+            font=font(px(14)),
             fill=QUIET,
             anchor=f"r{anchor}",
         )

@@ -13,6 +13,9 @@ from settings import Control, Key, Section
 from ultrasound.probe import Probe, ScannerSettings
 
 Technique = Literal["enucleation", "enucleoresection", "wedge"]
+# Where the kidney is seen from: from beside the supine patient; as the scope of a transperitoneal operation
+# sees it, with the patient on the other side; from the front; from the back.
+Approach = Literal["bedside", "surgeon's scope", "from above", "from behind"]
 Phase = Literal["Scan", "Score", "Excise", "Inspect"]
 PHASES: tuple[Phase, ...] = get_args(Phase)
 
@@ -25,6 +28,9 @@ class ViewSettings(Section):
     """What the window shows."""
 
     phase: Annotated[Phase, Key("Shift+Return", "View", "next phase: scan, score, excise, inspect")] = "Scan"
+    approach: Annotated[
+        Approach, Key("Shift+V", "View", "view: bedside, surgeon's scope, from above, from behind")
+    ] = "bedside"
     translucent: Annotated[
         bool, Control("Translucent", "View"), Key("T", "View", "organ translucent or solid")
     ] = True
@@ -102,16 +108,24 @@ class Geometry:
     """Box that the camera frames, minimum and maximum corner [mm], shape (2, 3)."""
     up: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     """Direction opposite to gravity, shape (3,)."""
+    lateral: np.ndarray = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))
+    """Direction to the side of the patient that the organ is on, shape (3,)."""
     transducer: TransducerHousing = TransducerHousing((40.0, 10.0, 20.0))
     tumour: Surface | None = None
     parts: dict[str, Surface] = field(default_factory=dict)
     """Other structures in the organ, by tissue."""
+    vessel_kinds: np.ndarray | None = None
+    """Of each vertex of the part "vessel": artery, vein, or vessel where that is not known, shape (n,)."""
     support: Surface | None = None
     """It does not move."""
     specimen: Surface | None = None
     """What was cut out, beside the organ. It does not move."""
+    tumour_cut_out: Surface | None = None
+    """The tumour in the specimen. It does not move."""
     bed: Surface | None = None
     """The faces of the organ that a cut has made."""
+    seen_vertices: np.ndarray | None = None
+    """For each vertex of the organ its index in the coverage, shape (n,); None where they are the same."""
 
 
 @dataclass(frozen=True)

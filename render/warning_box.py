@@ -9,7 +9,7 @@ from render.text import font, wrapped
 from render.ultrasound_panel import ALERT, FINDINGS
 from render.window_layout import FIGURE_HEIGHT, Rect, WindowLayout
 
-LETTERS_PX = 13
+LETTERS_PX = 14
 
 
 def warning_rect(layout: WindowLayout, warnings: tuple[str, ...], taken: int = 0) -> Rect | None:

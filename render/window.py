@@ -20,6 +20,7 @@ from typing import Any, Generic
 import numpy as np
 import taichi as ti
 
+from render.approaches import look_by
 from render.background_image import BackgroundImage
 from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
 from render.display import display_available
@@ -128,6 +129,7 @@ class Window(Generic[UserSettings]):
             (self.layout.width, self.layout.height),
         )
         self.camera = OrbitCamera(geometry.bounds, geometry.up, part, size[0] / size[1])
+        self._look()
         self._scene_view = SceneView(geometry, self.camera)
         self._software = SoftwareScene(self.camera, size) if self._by_processor else None
         self._frame_at = self._scene_at = 0.0
@@ -192,10 +194,17 @@ class Window(Generic[UserSettings]):
         self._quit = True
 
     def read_controls(self) -> Controls[UserSettings]:
-        controls = Controls(settings=self.settings)
+        controls, before = Controls(settings=self.settings), self.settings.view.approach
         self._read(controls)
         self.settings = controls.settings
+        if (approach := self.settings.view.approach) != before:
+            controls.message = f"View: {approach}."
         return controls
+
+    def _look(self) -> None:
+        """See the organ by the approach that is set."""
+        self._approach = self.settings.view.approach
+        look_by(self.camera, self._approach, self._geometry.lateral)
 
     def _read(self, controls: Controls) -> None:
         now = time.perf_counter()
@@ -221,7 +230,7 @@ class Window(Generic[UserSettings]):
         if self._gamepad is not None:
             self._gamepad.read(controls, elapsed)
         if controls.reset:
-            self.camera.go_home()
+            self._look()
 
     def _read_cursor(self) -> None:
         cursor = np.array(self._window.get_cursor_pos(), dtype=np.float64)
@@ -330,6 +339,8 @@ class Window(Generic[UserSettings]):
 
     def draw(self, view: View) -> None:
         """Show a view. Off-screen, only store it for `picture`."""
+        if self.settings.view.approach != self._approach:
+            self._look()
         self._view = view
         if self._visible:
             self._draw_frame(view)

@@ -14,9 +14,11 @@ MESSAGE_LINES, MESSAGE_PITCH = 3, 20
 TOOL_ROWS, TOOL_HEIGHT, TOOL_GAP = 2, 28, 6
 HEADER_HEIGHT, FOOTER_HEIGHT = 74, 52
 STATUS_MIDDLE, STATUS_HEIGHT = 43, 18
-RULER_WIDTH, WEDGE_WIDTH, IMAGE_GAP, NAME_HEIGHT = 42, 30, 10, 26
+RULER_WIDTH, WEDGE_WIDTH, IMAGE_GAP, NAME_HEIGHT = 42, 33, 10, 26
 SCANNER_GAP = 6
-FINDINGS_GAP, FINDINGS_WIDTH, FIGURE_HEIGHT, FIGURES_PAD = 10, 178, 20, 7
+FINDINGS_GAP, FIGURE_HEIGHT, FIGURES_PAD = 10, 21, 7
+# The second is in a window that is smaller than FULL_SIZE, beside its sliders.
+FINDINGS_WIDTH, SMALL_FINDINGS_WIDTH = 204, 178
 COMPASS_SIZE = 92
 # Warnings cover at most this share of the 3D view.
 MOST_WARNED = 0.4
@@ -27,7 +29,7 @@ FULL_SIZE, LEAST_SCALE, MOST_SCALE = (1280, 720), 0.8, 4.0
 # How much larger images must be one under the other to be preferred to side by side.
 BELOW_FROM = 1.2
 # Where images side by side would leave height empty, the others are smaller than the first, by this share.
-OTHERS_SHARE = 0.6
+OTHERS_SHARE = 0.5
 
 
 class Rect(NamedTuple):
@@ -183,7 +185,8 @@ class WindowLayout:
     def findings(self, count: int) -> Rect:
         """The box of this many findings, over the 3D view's upper left corner."""
         gap, height = self.px(FINDINGS_GAP), count * self.px(FIGURE_HEIGHT) + 2 * self.figures_pad
-        return Rect(gap, self.scene.top + gap, self.px(FINDINGS_WIDTH), height)
+        width = FINDINGS_WIDTH if self.scale >= 1 else SMALL_FINDINGS_WIDTH
+        return Rect(gap, self.scene.top + gap, self.px(width), height)
 
     def sliders(self, widths: list[float]) -> list[Rect]:
         """Boxes for groups of sliders, side by side in the strip, in proportion to `widths`."""
@@ -243,6 +246,10 @@ class WindowLayout:
             return [Rect(left, header + j * (height + between), width, height) for j in range(count)]
         shares = np.r_[1.0, np.full(count - 1, OTHERS_SHARE)]
         first = min((room_x - (count - 1) * gap) / shares.sum() / width_mm, room_y / depth_mm)
+        if count > 1:
+            # Where the first is as high as the panel, the others have the width that is left.
+            left_over = (room_x - (count - 1) * gap) / (first * width_mm) - 1
+            shares[1:] = min(1.0, left_over / (count - 1))
         # As low as the panel they have one size.
         scales = first * shares if beside * depth_mm < room_y else np.full(count, beside)
         widths, heights = (np.maximum(1, np.rint(mm * scales)).astype(int) for mm in (width_mm, depth_mm))

@@ -23,7 +23,8 @@ LEAST_LAG_MM = 1.0
 class RestGeometry:
     """The surfaces at rest [mm], of one version: a cut makes another one, and undo returns to the one before.
 
-    ``organ`` is what remains after a ``cut``; ``tumour`` and ``parts`` are what the cut leaves of them.
+    ``organ`` is what remains after a ``cut``; ``tumour`` and ``parts`` are what the cut leaves of them, and
+    ``tumour_cut_out`` is what came with the specimen.
     ``interpolation`` is for points of the tissue that is there, ``whole`` for those of the whole organ.
     """
 
@@ -34,6 +35,7 @@ class RestGeometry:
     interpolation: Interpolation
     whole: Interpolation
     cut: Cut | None = None
+    tumour_cut_out: trimesh.Trimesh | None = None
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ from rehearsal.loop.frame import (
 )
 from rehearsal.loop.state import History, WholeState
 from rehearsal.pressed_organ import PressedOrgan
-from rehearsal.resection.cut import Cut, CutSettings, check_hilum, hilum_of, part_left
+from rehearsal.resection.cut import Cut, CutSettings, check_hilum, hilum_of, part_cut_out, part_left
 from rehearsal.resection.resection_state import NO_RESECTION, Attempt, CutRequest, Resection, cut_of
 from rehearsal.resection.score_line import ResectionError
 from settings import Value, with_values
@@ -273,6 +273,7 @@ class Timeline:
             tumour=tumour,
             parts={tissue: part for tissue, part in parts.items() if part is not None},
             cut=cut,
+            tumour_cut_out=None if whole.tumour is None else part_cut_out(whole.tumour, cut),
         )
 
     def _show(self, resection: Resection, geometry: RestGeometry) -> None:

@@ -285,3 +285,11 @@ def part_left(part: trimesh.Trimesh, cut: Cut | None, is_within: bool = False) -
     solid = solid_of(part, "part")
     left = solid ^ solid_of(cut.remnant, "organ") if is_within else solid - solid_of(cut.specimen, "specimen")
     return surface_of(left)[0] if left.volume() > LEAST_LEFT_MM3 else None
+
+
+def part_cut_out(part: trimesh.Trimesh, cut: Cut) -> trimesh.Trimesh | None:
+    """The surface of what a cut takes of a part within the organ; None where that is next to nothing. Raises
+    PatientError.
+    """
+    out = solid_of(part, "part") ^ solid_of(cut.specimen, "specimen")
+    return surface_of(out)[0] if out.volume() > LEAST_LEFT_MM3 else None

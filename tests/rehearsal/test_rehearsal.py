@@ -22,6 +22,7 @@ from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_maps import LabelMap
 from scenes.phantom.embedded_patient import phantom_folder
 from scenes.scene import PAPER, Press, Scene, load_scene, with_options
+from scenes.surfaces import translated
 from scenes.volumes.lazy_volume import LazyVolume
 from settings import with_values
 from sim.fields import array_of
@@ -261,3 +262,13 @@ def test_the_outline_is_the_tumours_border_not_what_is_drawn_of_it(rehearsal):
     places = (flat @ plane.world_from_plane.T)[:, :3]
     away = signed_distance(anatomy.tumour_vertices, np.asarray(anatomy.tumour.faces), places)[0]
     assert len(outline) > 20 and np.abs(away).max() < 1e-3
+
+
+@pytest.mark.parametrize("side, at_x", [("left", 60.0), ("right", -60.0)])
+def test_the_case_has_the_side_of_its_kidney(side, at_x):
+    scene, folder = phantom()
+    loaded = load_anatomy(scene, folder)
+    moved = translated(loaded.organ, np.array([at_x - loaded.organ.bounds[:, 0].mean(), 0.0, 0.0]))
+    case = case_of(scene, replace(loaded, organ=moved))
+    # LPS: x is to the left.
+    assert case.lateral.tolist() == [1.0 if side == "left" else -1.0, 0.0, 0.0]

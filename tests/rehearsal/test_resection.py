@@ -148,7 +148,13 @@ def test_a_cut_keeps_the_margin_and_undo_brings_all_back_bit_for_bit(rehearsal, 
     assert not frame.notices and np.isfinite(frame.positions).all()
     assert anatomy.volume_ratio() == pytest.approx(1.0, abs=0.01)
     assert findings_of(judged)["specimen"].endswith("ml")
-    assert len(drawn_geometry(anatomy).bed[1]) == made.on_remnant.sum() > 100
+    drawn = drawn_geometry(anatomy)
+    # The faces of the cut are divided in four.
+    assert len(drawn.bed[1]) == 4 * made.on_remnant.sum() > 400
+    # All of the tumour is in the specimen, as large as it was.
+    in_specimen = anatomy.tumour_in_specimen
+    assert in_specimen.volume == pytest.approx(rehearsal.case.tumour.volume, rel=0.02)
+    assert len(drawn.tumour_cut_out[0]) == len(in_specimen.vertices)
     frame = rehearsal.do(Undo())
     assert anatomy.cut is drawn_geometry(anatomy).bed is None and len(frame.resection.marks) == len(marks)
     frame = rehearsal.do(Undo())

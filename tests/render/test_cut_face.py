@@ -1,7 +1,5 @@
 """The cut along the image plane: sections and faces of balls and blocks, known by hand; which half goes."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import trimesh
@@ -9,6 +7,7 @@ from conftest import rotation_about
 
 from render import cut_face
 from render.cut_face import Raster, oriented_section, side_of_eye
+from render.surface_shading import ShadedSurface
 from sim.fields import array_of, field_of
 
 RADIUS = 12.0
@@ -109,7 +108,7 @@ def test_the_face_lies_on_the_plane_in_the_colours_of_what_it_cuts(device, ball,
     monkeypatch.setattr(cut_face, "CELLS", 60)
     kernel = trimesh.creation.icosphere(subdivisions=2, radius=4.0).apply_translation([5.0, 0, 0])
     organ, tumour = (
-        SimpleNamespace(vertices=field_of(mesh.vertices, 1), faces=mesh.faces, base=colour)
+        ShadedSurface(field_of(mesh.vertices, 1), np.asarray(mesh.faces, np.int32), colour)
         for mesh, colour in ((ball, (0.5, 0.1, 0.1)), (kernel, (1.0, 0.8, 0.0)))
     )
     pose, scene = plane((0, 1, 0), (0, 0, 1), 20.0), Handed()
