@@ -3,11 +3,13 @@ that the user saves.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from time import perf_counter
+from typing import Literal
 
 import numpy as np
 
@@ -34,7 +36,7 @@ from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer, send_live
 from rehearsal.tracking.sweep_recording import SweepRecorder
 from render.keys import Keys
 from render.viewer import Controls, View
-from scenes.import_findings import acknowledge
+from scenes.import_findings import acknowledge, side_of
 from scenes.scene import SceneError
 from ultrasound.probe import Probe
 
@@ -183,6 +185,11 @@ class WindowPanel:
 
     def _hint(self, settings: LiveSettings) -> str:
         phase, coming = settings.view.phase, cut_settings(settings)
+        guide = self.measurements.guide
+        if phase == "Scan" and guide is not None:
+            guided = guide.next_in_words(self._side, has_keys=self._has_keys)
+            if guided:
+                return self.keys.worded(guided)
         return self.keys.worded(hint(phase, self.anatomy, self.measurements, self.resection, coming))
 
     def _findings(self, view: View, settings: LiveSettings) -> dict[str, str]:
@@ -206,10 +213,22 @@ class WindowPanel:
         factor = times.rates(RECENT_S)[1]
         return "" if self._frozen or factor >= REAL_TIME else f"{factor:.1g} x real"
 
+    @property
+    def _has_keys(self) -> bool:
+        """Whether mouse and keys control the probe."""
+        source = self.source.user if isinstance(self.source, ReplaySource) else self.source
+        return not self._frozen and isinstance(source, UserSource) and source.is_manual
+
+    @cached_property
+    def _side(self) -> Literal["left", "right"] | None:
+        # The directions can be said without it.
+        with suppress(SceneError):
+            return side_of(self.anatomy.case.scene, self.folder)
+        return None
+
     def _with_hint(self, note: str) -> str:
         """A note that there is no contact, with the keys that press if these control the probe."""
-        source = self.source.user if isinstance(self.source, ReplaySource) else self.source
-        if self._frozen or not isinstance(source, UserSource) or not source.is_manual:
+        if not self._has_keys:
             return note
         return self.keys.worded(f"{note}\n{HOW_TO_PRESS}")
 

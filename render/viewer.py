@@ -124,6 +124,8 @@ class Guidance:
     """Path of the centre of the array face, segments of shape (n, 2, 3)."""
     done: np.ndarray
     """Whether each segment is done, bool, shape (n,)."""
+    arrows_mm: tuple[np.ndarray, ...] = ()
+    """Paths that lead to the next pose, each of shape (k, 3)."""
 
 
 @dataclass(frozen=True)
