@@ -247,6 +247,20 @@ def test_the_named_degree_of_freedom_does_not_change_with_each_frame():
 # Arrows
 
 
+@pytest.mark.parametrize("turn_deg", TURNS)
+@pytest.mark.parametrize("place", list(OUTWARD))
+def test_arrows_point_as_the_words_do(place, turn_deg):
+    manipulator = manipulator_at(place, turn_deg)
+    start = manipulator.pose()
+    for turn in (*(20.0 * np.eye(3)), *(-20.0 * np.eye(3))):
+        goal = manipulator.turned_by(start, turn)
+        named = max(freedom_distances(manipulator, start, goal), key=lambda one: one.weight_mm)
+        arrows = arrows_between(manipulator, start, goal)
+        assert len(arrows) == (1 if named.freedom == "rotate" else 2)
+        way = sum(arrow[-1] - arrow[0] for arrow in arrows)
+        assert way @ named.direction > 0.97 * np.linalg.norm(way) * np.linalg.norm(named.direction)
+
+
 def test_arrows_point_to_the_goal_and_are_long_enough_to_be_seen():
     manipulator = manipulator_at("flank", (0.0, 0.0, 0.0))
     start = manipulator.pose()
@@ -258,11 +272,16 @@ def test_arrows_point_to_the_goal_and_are_long_enough_to_be_seen():
     near[:3, 3] += [0.0, 1.0, 0.0]
     (move,) = arrows_between(manipulator, start, near)
     assert move[1] - move[0] == pytest.approx([0.0, LEAST_ARROW_MM, 0.0])
-    (turn,) = arrows_between(manipulator, start, manipulator.turned_by(start, np.array([0.0, 3.0, 0.0])))
-    radius = turn - (start @ [0.0, 0.0, -SIZE[2] / 2, 1.0])[:3]
-    assert np.linalg.norm(radius, axis=1) == pytest.approx(BEAM_MM)
-    cosine = radius[0] @ radius[-1] / BEAM_MM**2
-    assert np.degrees(np.arccos(cosine)) == pytest.approx(LEAST_ARROW_DEG)
+    rocked = arrows_between(manipulator, start, manipulator.turned_by(start, np.array([0.0, 3.0, 0.0])))
+    # At both sides of the image, which would hide one of them.
+    sides = [arrow @ start[:3, 1] for arrow in rocked]
+    assert np.ptp(sides, axis=1) == pytest.approx(0.0, abs=1e-9) and sides[0][0] < sides[1][0]
+    for arrow in rocked:
+        radius = arrow - (start @ [0.0, 0.0, -SIZE[2] / 2, 1.0])[:3]
+        radius -= np.outer(radius @ start[:3, 1], start[:3, 1])
+        assert np.linalg.norm(radius, axis=1) == pytest.approx(BEAM_MM)
+        cosine = radius[0] @ radius[-1] / BEAM_MM**2
+        assert np.degrees(np.arccos(cosine)) == pytest.approx(LEAST_ARROW_DEG)
     assert arrows_between(manipulator, start, start) == ()
 
 

@@ -31,7 +31,7 @@ from rehearsal.window_loop import PREPARING, WindowLoop
 from rehearsal.window_panel import WindowPanel
 from render.viewer import Controls, View, ViewSettings
 from render.window import NoVulkan
-from scenes.scene import EMBEDDED, SceneError, load_scene
+from scenes.scene import EMBEDDED, AnatomyFiles, SceneError, load_scene
 from scenes.terminal import shell_command
 from settings import with_values
 from ultrasound.probe import load_probe
@@ -327,6 +327,24 @@ def test_what_is_wrong_with_the_tissue_stands_before_all_that_is_technical(loopi
     assert view.messages == ("Undo",)
     assert view.status == "COMPRESSED   RECORDING 3 s   REDUCED ITERATIONS   PLANNING"
     assert looping.next(freeze=True).status == "COMPRESSED   RECORDING 3 s   FROZEN   PLANNING"
+
+
+def test_guidance_along_a_plan_is_in_the_place_of_the_hint_while_scanning(looping):
+    asked = []
+    looping.measurements.guide = SimpleNamespace(
+        next_in_words=lambda side, has_keys: (
+            asked.append((side, has_keys)) or "tilt: {tilt_forward}\nTo go: 3"
+        )
+    )
+    looping.anatomy.case.scene.anatomy = AnatomyFiles(phantom=True)
+    assert looping.next().hint == "tilt: C\nTo go: 3"
+    # No mouse and keys move this probe.
+    assert asked[-1] == ("left", False)
+    settings = with_values(looping.viewer.settings, {"view.phase": "Score"})
+    assert looping.next(settings=settings).hint == "This patient has no tumour: there is nothing to cut out."
+    looping.measurements.guide.next_in_words = lambda side, has_keys: ""
+    settings = with_values(settings, {"view.phase": "Scan"})
+    assert looping.next(settings=settings).hint.startswith("The probe follows the mouse")
 
 
 def test_messages_that_were_read_are_in_the_log(looping):
