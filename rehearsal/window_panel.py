@@ -20,6 +20,7 @@ from rehearsal.image_and_surface_files import save_screenshot, save_surfaces, sa
 from rehearsal.imaging import image_view, readouts
 from rehearsal.live_settings import LiveSettings
 from rehearsal.loop.protocols import Source
+from rehearsal.machine_signs import machine_signs
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.message_log import MessageLog
 from rehearsal.notices import Notices
@@ -28,6 +29,7 @@ from rehearsal.phase_hints import hint
 from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.quit_check import QuitCheck
 from rehearsal.real_time.frame_times import FrameTimes
+from rehearsal.real_time.pace import SEPARATOR
 from rehearsal.resection.attempts import AttemptFigureList
 from rehearsal.resection.resection_view import ResectionView, cut_settings
 from rehearsal.sources.scripted import ReplaySource
@@ -35,7 +37,7 @@ from rehearsal.sources.user import UserSource
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer, send_live
 from rehearsal.tracking.sweep_recording import SweepRecorder
 from render.keys import Keys
-from render.viewer import Controls, View
+from render.viewer import Controls, Sign, View
 from scenes.import_findings import acknowledge, side_of
 from scenes.scene import SceneError
 from ultrasound.probe import Probe
@@ -149,6 +151,7 @@ class WindowPanel:
             clock=f"{time_s:.1f} s",
             pace=self._pace(times),
             status=self._status(view),
+            signs=self._signs(),
             messages=self.messages.shown(perf_counter()),
             hint=self._hint(settings),
             findings=self._findings(view, settings),
@@ -233,9 +236,18 @@ class WindowPanel:
         return self.keys.worded(f"{note}\n{HOW_TO_PRESS}")
 
     def _status(self, view: View) -> str:
-        """The text over the images, the most important first: text that does not fit is cut at the end."""
-        parts = [view.status, self.sweeping.status, self._state(), self.plans.status]
-        return self.keys.worded("   ".join(filter(None, parts)))
+        """The text over the images, of what makes them other than they seem, the most important first: text
+        that does not fit is cut at the end.
+        """
+        return self.keys.worded("   ".join(filter(None, [view.status, self._state()])))
+
+    def _signs(self) -> tuple[Sign, ...]:
+        """The states of the machine."""
+        replay = self.source.replay_status if isinstance(self.source, ReplaySource) else ""
+        pace = [] if self._frozen else self.anatomy.frame.pace.split(SEPARATOR)
+        signs = machine_signs([self.sweeping.status, replay, *pace, self.plans.status])
+        worded = self.keys.worded
+        return tuple(replace(sign, text=worded(sign.text), meaning=worded(sign.meaning)) for sign in signs)
 
     def _state(self) -> str:
         if not self._frozen:

@@ -20,8 +20,8 @@ KEY_LIGHT, FILL_LIGHT, AMBIENT = (0.82, 0.80, 0.77), (0.17, 0.19, 0.23), (0.17, 
 TUMOUR, SUPPORT, EDGE, FRAME = (0.93, 0.76, 0.28), (0.30, 0.33, 0.36), (0.85, 0.9, 0.94), (0.25, 0.77, 1.0)
 PARTS = {"cyst": (0.30, 0.60, 0.86), "urine": (0.61, 0.74, 0.38), "vessel": (0.76, 0.16, 0.06)}
 LINE_WIDTH = 1.2
-# Panel, title, strip, compass, findings, warnings.
-MASKS = 6
+# Panel, title, strip, compass, findings, warnings, five signs and the meaning of one.
+MASKS = 12
 # Lines of a planned sweep.
 MAX_SEGMENTS = 2000
 TO_GO, DONE = np.array([1.0, 0.93, 0.17], np.float32), np.array([0.30, 0.75, 0.42], np.float32)

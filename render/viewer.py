@@ -143,6 +143,15 @@ class Score:
 
 
 @dataclass(frozen=True)
+class Sign:
+    """A state of the machine, such as that a sweep is recorded, in a few words, and what it means."""
+
+    text: str
+    meaning: str
+    is_recording: bool = False
+
+
+@dataclass(frozen=True)
 class TextTable:
     """A table of texts under headings; ``marked`` is the index of the row that is marked, if one is."""
 
@@ -209,9 +218,11 @@ class View:
     alert: str = ""
     """Name of the finding that exceeds its limit."""
     status: str = ""
-    """Short status texts over the image, such as FROZEN, three spaces apart, by falling priority: the last
-    are left out first.
+    """Short texts over the image of what makes it other than it seems, such as FROZEN, three spaces apart, by
+    falling priority: the last are left out first.
     """
+    signs: tuple[Sign, ...] = ()
+    """States of the machine that the image does not depend on, by falling priority."""
     clock: str = ""
     """The session's time, in simulated seconds: "42.6 s"."""
     pace: str = ""
