@@ -307,12 +307,12 @@ class RehearsalRun:
         except OSError as error:
             click.echo(f"Warning: the page of the resection is not saved: {error.strerror}")
 
-    def _save_report(self, session: Path, summary: dict[str, Any], attempts: list[dict[str, Any]]) -> None:
+    def _save_report(self, session: Path, summary: dict[str, Any], resection: dict[str, Any] | None) -> None:
         """Write the page of a recorded session for colleagues."""
         # With Matplotlib.
         from rehearsal.page.page_files import save_page_files
 
-        about = summary, self.images, attempts, self._import_remarks()
+        about = summary, self.images, resection, self.attempts.table(), self._import_remarks()
         try:
             written = save_page_files(self.anatomy, self.loaded, session, *about)
         except (OSError, UserError) as error:
@@ -366,7 +366,7 @@ class RehearsalRun:
             self._save_page(report, number_of(path))
         if recorder is not None:
             if not recorder.fault:
-                self._save_report(recorder.path, summary, [] if report is None else [report])
+                self._save_report(recorder.path, summary, report)
             scene = [] if self.options.scene == EMBEDDED else [self.options.scene]
             again = shell_command("rehearse", *scene, "--replay", recorder.path)
             click.echo(recorder.fault or f"Recorded; replay it with: {again}")

@@ -3,11 +3,13 @@ that the user saves.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from time import perf_counter
+from typing import Literal
 
 import numpy as np
 
@@ -18,6 +20,7 @@ from rehearsal.image_and_surface_files import save_screenshot, save_surfaces, sa
 from rehearsal.imaging import image_view, readouts
 from rehearsal.live_settings import LiveSettings
 from rehearsal.loop.protocols import Source
+from rehearsal.machine_signs import machine_signs
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.message_log import MessageLog
 from rehearsal.notices import Notices
@@ -26,6 +29,7 @@ from rehearsal.phase_hints import hint
 from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.quit_check import QuitCheck
 from rehearsal.real_time.frame_times import FrameTimes
+from rehearsal.real_time.pace import SEPARATOR
 from rehearsal.resection.attempts import AttemptFigureList
 from rehearsal.resection.resection_view import ResectionView, cut_settings
 from rehearsal.sources.scripted import ReplaySource
@@ -33,8 +37,8 @@ from rehearsal.sources.user import UserSource
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer, send_live
 from rehearsal.tracking.sweep_recording import SweepRecorder
 from render.keys import Keys
-from render.viewer import Controls, View
-from scenes.import_findings import acknowledge
+from render.viewer import Controls, Sign, View
+from scenes.import_findings import acknowledge, side_of
 from scenes.scene import SceneError
 from ultrasound.probe import Probe
 
@@ -147,6 +151,7 @@ class WindowPanel:
             clock=f"{time_s:.1f} s",
             pace=self._pace(times),
             status=self._status(view),
+            signs=self._signs(),
             messages=self.messages.shown(perf_counter()),
             hint=self._hint(settings),
             findings=self._findings(view, settings),
@@ -183,6 +188,11 @@ class WindowPanel:
 
     def _hint(self, settings: LiveSettings) -> str:
         phase, coming = settings.view.phase, cut_settings(settings)
+        guide = self.measurements.guide
+        if phase == "Scan" and guide is not None:
+            guided = guide.next_in_words(self._side, has_keys=self._has_keys)
+            if guided:
+                return self.keys.worded(guided)
         return self.keys.worded(hint(phase, self.anatomy, self.measurements, self.resection, coming))
 
     def _findings(self, view: View, settings: LiveSettings) -> dict[str, str]:
@@ -206,17 +216,38 @@ class WindowPanel:
         factor = times.rates(RECENT_S)[1]
         return "" if self._frozen or factor >= REAL_TIME else f"{factor:.1g} x real"
 
+    @property
+    def _has_keys(self) -> bool:
+        """Whether mouse and keys control the probe."""
+        source = self.source.user if isinstance(self.source, ReplaySource) else self.source
+        return not self._frozen and isinstance(source, UserSource) and source.is_manual
+
+    @cached_property
+    def _side(self) -> Literal["left", "right"] | None:
+        # The directions can be said without it.
+        with suppress(SceneError):
+            return side_of(self.anatomy.case.scene, self.folder)
+        return None
+
     def _with_hint(self, note: str) -> str:
         """A note that there is no contact, with the keys that press if these control the probe."""
-        source = self.source.user if isinstance(self.source, ReplaySource) else self.source
-        if self._frozen or not isinstance(source, UserSource) or not source.is_manual:
+        if not self._has_keys:
             return note
         return self.keys.worded(f"{note}\n{HOW_TO_PRESS}")
 
     def _status(self, view: View) -> str:
-        """The text over the images, the most important first: text that does not fit is cut at the end."""
-        parts = [view.status, self.sweeping.status, self._state(), self.plans.status]
-        return self.keys.worded("   ".join(filter(None, parts)))
+        """The text over the images, of what makes them other than they seem, the most important first: text
+        that does not fit is cut at the end.
+        """
+        return self.keys.worded("   ".join(filter(None, [view.status, self._state()])))
+
+    def _signs(self) -> tuple[Sign, ...]:
+        """The states of the machine."""
+        replay = self.source.replay_status if isinstance(self.source, ReplaySource) else ""
+        pace = [] if self._frozen else self.anatomy.frame.pace.split(SEPARATOR)
+        signs = machine_signs([self.sweeping.status, replay, *pace, self.plans.status])
+        worded = self.keys.worded
+        return tuple(replace(sign, text=worded(sign.text), meaning=worded(sign.meaning)) for sign in signs)
 
     def _state(self) -> str:
         if not self._frozen:

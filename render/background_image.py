@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw
 from render.keys import Keys, default_keys
 from render.message_box import log_image, message_image
 from render.phases import GAP_PX, TAB_PX, TOOL_PX, Tool, tabs_of
+from render.sign_row import meaning_image, meaning_rect, sign_at, sign_boxes, sign_image
 from render.table_box import table_image, table_rect
 from render.text import fitting_size, font, shortened
 from render.ultrasound_panel import (
@@ -35,7 +36,7 @@ from render.ultrasound_panel import (
     status_image,
     to_plane,
 )
-from render.viewer import Phase, View
+from render.viewer import Phase, Sign, View
 from render.warning_box import warning_image, warning_rect
 from render.window_layout import CLOCK_WIDTH, FIGURE_HEIGHT, Rect, WindowLayout
 
@@ -76,6 +77,7 @@ class BackgroundImage:
         self._rows = self.pixels.transpose(1, 0, 2)[::-1]
         self._view: View | None = None
         self._taken = 0
+        self._pointed: tuple[float, float] | None = None
         self._backdrop: tuple = ()
         self.has_scene = False
         # The page over everything, with what is on it; empty without one.
@@ -93,11 +95,13 @@ class BackgroundImage:
         axes: np.ndarray,
         taken: int = 0,
         slow_figures: bool = False,
+        pointed: tuple[float, float] | None = None,
     ) -> None:
         """Draw a view, with the compass for a camera's axes (3, 3): right, up and ahead, in patient
         coordinates.
 
-        Sliders beside the warnings have ``taken`` so many pixels at the right of the 3D view.
+        A sign at the column and row ``pointed`` at shows its meaning. Sliders beside warnings and signs have
+        ``taken`` so many pixels at the right of the 3D view.
         With ``slow_figures``, figures change only every READOUT_PERIOD_S, so that they can be read.
         """
         findings = self._findings_of(view)
@@ -113,12 +117,14 @@ class BackgroundImage:
             view.warnings,
             taken,
             table_rect(self.layout, view.table),
+            sign_boxes(self.layout, view.signs, taken),
+            sign_at(self.layout, view.signs, pointed, taken),
         )
         if self._page or self._backdrop != parts:
             self._rows[:, :, :3] = backdrop(self.layout, view, self.keys.of["help"], *self._tools)
             self._figures, self._axes, self._status, self._messages, self._page = None, None, None, None, ()
             self._empty_scene, self.has_scene = self._scene.copy(), False
-        self._view, self._backdrop, self._taken = view, parts, taken
+        self._view, self._backdrop, self._taken, self._pointed = view, parts, taken, pointed
         for (name, image), box in zip(view.shown.items(), image_boxes(self.layout, view), strict=True):
             paste_image(self._rows, box, image)
             self._draw_over(view, name, box)
@@ -138,6 +144,10 @@ class BackgroundImage:
             self._put(warned, warning_image(self.layout, view.warnings, self._taken))
         if view.table is not None and (over := table_rect(self.layout, view.table)) is not None:
             self._put(over, table_image(self.layout, view.table))
+        for sign, box in zip(view.signs, sign_boxes(self.layout, view.signs, taken), strict=False):
+            self._put(box, sign_image(self.layout, sign))
+        if (over_sign := self._pointed_sign(view)) is not None:
+            self._put(meaning_rect(self.layout, over_sign), meaning_image(self.layout, over_sign))
 
     def put_tools(self, phase: Phase, tools: list[Tool]) -> None:
         """Have the tools of a phase in the images that follow."""
@@ -155,16 +165,22 @@ class BackgroundImage:
         self.has_scene = True
 
     def boxes_over_scene(self, view: View) -> list[Rect]:
-        """The boxes that cover the 3D view: compass, findings, warnings, table."""
+        """The boxes that cover the 3D view: compass, findings, warnings, table, signs."""
         count = len(self._findings_of(view))
         findings = self.layout.findings(count) if count else None
         table = table_rect(self.layout, view.table)
-        boxes = self.layout.compass, findings, self._warning_rect(view), table
+        sign = self._pointed_sign(view)
+        meaning = None if sign is None else meaning_rect(self.layout, sign)
+        signs = sign_boxes(self.layout, view.signs, self._taken)
+        boxes = self.layout.compass, findings, self._warning_rect(view), table, *signs, meaning
         return [box for box in boxes if box is not None]
 
     def _findings_of(self, view: View) -> dict[str, str]:
         """The findings that are shown: none where a table has their place."""
         return first_of(view.findings, self.layout.most_findings) if view.table is None else {}
+
+    def _pointed_sign(self, view: View) -> Sign | None:
+        return sign_at(self.layout, view.signs, self._pointed, self._taken)
 
     def _warning_rect(self, view: View) -> Rect | None:
         return warning_rect(self.layout, view.warnings, self._taken)

@@ -31,11 +31,11 @@ def message_lines(layout: WindowLayout, messages: tuple[str, ...]) -> tuple[list
 
 
 def message_image(layout: WindowLayout, messages: tuple[str, ...], hint: str = "") -> np.ndarray:
-    """The box of messages, or where there are none of a hint, uint8, shape of layout.messages."""
+    """The box of messages, or without any of the lines of a hint, uint8, shape of layout.messages."""
     box = layout.messages
     image = Image.new("RGB", (box.width, box.height), STRIP)
     draw, colour = ImageDraw.Draw(image), ALERT if messages else TEXT
-    lines, size = message_lines(layout, messages or (hint,))
+    lines, size = message_lines(layout, messages or tuple(hint.split("\n")))
     for place, line in enumerate(lines):
         middle = layout.px(MESSAGE_PITCH) * (place + 0.5) + layout.figures_pad / 2
         draw.text((layout.px(BESIDE_PX), middle), line, font=font(size), fill=colour, anchor="lm")

@@ -27,13 +27,15 @@ PARTS = {
     "vessel": (0.56, 0.30, 0.66),
 }
 LINE_WIDTH = 1.2
-# Panel, title, strip, compass, findings, warnings.
-MASKS = 6
+# Panel, title, strip, compass, findings, warnings, five signs and the meaning of one.
+MASKS = 12
 # Lines of a planned sweep.
 MAX_SEGMENTS = 2000
 TO_GO, DONE = np.array([1.0, 0.93, 0.17], np.float32), np.array([0.30, 0.75, 0.42], np.float32)
 GOAL = (1.0, 0.86, 0.45)
 PLAN_WIDTH, GOAL_WIDTH = 2.6, 1.8
+# Arrows to the next pose: so many segments at most, and the tip's length and slope.
+ARROW, ARROW_WIDTH, MAX_ARROW, TIP_MM, TIP_SLOPE = (1.0, 0.45, 0.85), 3.0, 64, 3.5, 0.5
 # The hand, where the probe stays behind it.
 GHOST, GHOST_WIDTH = (0.98, 0.55, 0.20), 1.8
 SPECIMEN, BED = (0.72, 0.45, 0.38), (0.86, 0.56, 0.47)
@@ -125,7 +127,7 @@ class SceneView:
             self._draw_inner(scene, inner, eye, key, ahead, cut)
         if view.guidance is not None:
             self.plan_lines = self.plan_lines or PlanLines(self._probe_edges)
-            self.plan_lines.draw(scene, view.guidance)
+            self.plan_lines.draw(scene, view.guidance, toward=-ahead)
         if view.score is not None:
             self.score_lines = self.score_lines or ScoreLines()
             self.score_lines.draw(scene, view.score, toward=-ahead)
@@ -230,7 +232,8 @@ class SceneView:
 
 
 class PlanLines:
-    """A planned sweep: the path of the array face, and the outline of the probe at the next pose.
+    """A planned sweep: the path of the array face, the outline of the probe at the next pose, and arrows
+    that lead there.
 
     Of a path of more than MAX_SEGMENTS only every n-th segment is drawn.
     """
@@ -239,10 +242,11 @@ class PlanLines:
         self._edges = edges
         self._goal = zeros(len(edges), 3, within=1)
         self._path, self._colours = (zeros(2 * MAX_SEGMENTS, 3, within=1) for _ in range(2))
+        self._arrows = zeros(2 * MAX_ARROW, 3, within=1)
         self._shown = np.zeros((0, 2, 3)), 0
 
-    def draw(self, scene, guidance: Guidance) -> None:
-        """Draw the lines into a scene."""
+    def draw(self, scene, guidance: Guidance, toward: np.ndarray) -> None:
+        """Draw the lines into a scene, seen from ``toward`` (3,)."""
         path, done = guidance.path_mm, int(guidance.done.sum())
         if self._shown[0] is not path or self._shown[1] != done:
             self._fill(guidance)
@@ -251,6 +255,13 @@ class PlanLines:
         if guidance.goal is not None:
             fill((self._goal, transducer_shape.placed(self._edges, guidance.goal)))
             scene.lines(self._goal, GOAL_WIDTH, color=GOAL)
+        if guidance.arrows_mm:
+            arrows = np.concatenate([arrow_segments(path, toward) for path in guidance.arrows_mm])[:MAX_ARROW]
+            # Unused segments have no length.
+            points = np.repeat(arrows[-1:, 1], 2 * MAX_ARROW, axis=0).astype(np.float32)
+            points[: 2 * len(arrows)] = arrows.reshape(-1, 3)
+            fill((self._arrows, points))
+            scene.lines(self._arrows, ARROW_WIDTH, color=ARROW)
 
     def _fill(self, guidance: Guidance) -> None:
         every = -(-len(guidance.path_mm) // MAX_SEGMENTS)
@@ -315,6 +326,19 @@ def _colours_of(tissue: str, geometry: Geometry) -> np.ndarray:
 def _still(surface: Surface | None, colour: tuple[float, float, float]) -> ShadedSurface | None:
     """A surface that does not move, if there is one."""
     return None if surface is None else ShadedSurface(field_of(surface[0], within=1), surface[1], colour)
+
+
+def arrow_segments(path: np.ndarray, toward: np.ndarray) -> np.ndarray:
+    """The segments (k + 1, 2, 3) of a path (k, 3) and of a tip at its end, whose sides are seen from
+    ``toward`` (3,).
+    """
+    end, back = path[-1], path[-2] - path[-1]
+    back = back / np.linalg.norm(back)
+    across = np.cross(back, toward)
+    across /= max(float(np.linalg.norm(across)), 1e-6)
+    sides = np.stack([end + TIP_MM * (back + sign * TIP_SLOPE * across) for sign in (-1.0, 1.0)])
+    shaft = np.stack([path[:-1], path[1:]], axis=1)
+    return np.concatenate([shaft, np.stack([np.stack([end, end]), sides], axis=1)])
 
 
 def thinned(line: np.ndarray) -> np.ndarray:

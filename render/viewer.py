@@ -138,6 +138,8 @@ class Guidance:
     """Path of the centre of the array face, segments of shape (n, 2, 3)."""
     done: np.ndarray
     """Whether each segment is done, bool, shape (n,)."""
+    arrows_mm: tuple[np.ndarray, ...] = ()
+    """Paths that lead to the next pose, each of shape (k, 3)."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +154,15 @@ class Score:
     """Whether each point of the line is nearer to the tumour than the margin asks, bool, shape (k,)."""
     planned_mm: np.ndarray
     """Points of the planned closed line, shape (p, 3); none of it without a plan."""
+
+
+@dataclass(frozen=True)
+class Sign:
+    """A state of the machine, such as that a sweep is recorded, in a few words, and what it means."""
+
+    text: str
+    meaning: str
+    is_recording: bool = False
 
 
 @dataclass(frozen=True)
@@ -221,9 +232,11 @@ class View:
     alert: str = ""
     """Name of the finding that exceeds its limit."""
     status: str = ""
-    """Short status texts over the image, such as FROZEN, three spaces apart, by falling priority: the last
-    are left out first.
+    """Short texts over the image of what makes it other than it seems, such as FROZEN, three spaces apart, by
+    falling priority: the last are left out first.
     """
+    signs: tuple[Sign, ...] = ()
+    """States of the machine that the image does not depend on, by falling priority."""
     clock: str = ""
     """The session's time, in simulated seconds: "42.6 s"."""
     pace: str = ""

@@ -401,7 +401,9 @@ class Window(Generic[UserSettings]):
                 self._change_layout(replace(self.layout, has_engineer=self.settings.view.show_engineer))
             self._place_sliders()
             self._place_tools()
-            self._background.compose(view, np.stack(self.camera.axes()), self._taken(), self._visible)
+            pointed = None if self._cursor is None else self._pixel(self._cursor)
+            axes = np.stack(self.camera.axes())
+            self._background.compose(view, axes, self._taken(), self._visible, pointed)
             keeps = self._is_ahead or self._keeps_scene()
             if self._software is not None and not (keeps and self._background.has_scene):
                 self._draw_by_processor(self._software, view)

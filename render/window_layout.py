@@ -19,7 +19,7 @@ SCANNER_GAP = 6
 FINDINGS_GAP, FIGURE_HEIGHT, FIGURES_PAD = 10, 21, 7
 # The second is in a window that is smaller than FULL_SIZE, beside its sliders.
 FINDINGS_WIDTH, SMALL_FINDINGS_WIDTH = 204, 178
-COMPASS_SIZE = 92
+COMPASS_SIZE, SIGN_HEIGHT = 92, 22
 # Warnings cover at most this share of the 3D view.
 MOST_WARNED = 0.4
 # A narrower strip shows no read-outs, so that the labels of its sliders fit.
@@ -164,12 +164,16 @@ class WindowLayout:
         return Rect(gap, self.scene.bottom - gap - size, size, size)
 
     @property
+    def signs(self) -> Rect:
+        """The row of signs at the foot of the 3D view, beside the compass."""
+        gap, height = self.px(FINDINGS_GAP), self.px(SIGN_HEIGHT)
+        left = self.compass.right + gap
+        return Rect(left, self.scene.bottom - gap - height, self.scene.right - gap - left, height)
+
+    @property
     def foot(self) -> Rect:
-        """The line at the foot of the 3D view, beside the compass, from which a box of warnings grows
-        upwards.
-        """
-        left, gap = self.compass.right + self.px(FINDINGS_GAP), self.px(FINDINGS_GAP)
-        return Rect(left, self.scene.bottom - gap, self.scene.right - gap - left, 0)
+        """The line above the signs from which a box of warnings grows upwards."""
+        return self.signs._replace(top=self.signs.top - self.px(FINDINGS_GAP), height=0)
 
     @property
     def highest_warning(self) -> int:

@@ -127,6 +127,14 @@ def acknowledged_warnings(scene: Scene, folder: Path) -> tuple[str, ...]:
     return () if findings is None else findings.acknowledged_warnings
 
 
+def side_of(scene: Scene, folder: Path) -> Literal["left", "right"] | None:
+    """The side of a scene's kidney; None where no import has stated it. Raises SceneError."""
+    if scene.anatomy.phantom:
+        return "left"
+    findings = read_findings(folder)
+    return None if findings is None else findings.side
+
+
 def import_remarks(scene: Scene, folder: Path) -> list[str]:
     """What others who look at a scene must know of its import: that it is a draft, and all warnings.
 

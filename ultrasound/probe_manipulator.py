@@ -5,6 +5,7 @@ lateral to the marked side, y elevation, z along its axis; the image leaves its 
 -z.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -295,6 +296,23 @@ class ProbeManipulator:
         turn = min(max(tilt, -60.0), 60.0), min(max(rock, -60.0), 60.0), rotate
         self.state = replace(self.state, turn_deg=turn)
 
+    def turns_to(self, pose: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """What ``turn`` has to add to tilt, rock and rotation (3,) [degrees, -180 to 180], so that the
+        transducer at a pose (4, 4) has the orientation of another.
+        """
+        aim = pose[:3, :3] @ _turn_matrix(self.state.turn_deg).T
+        wanted = Rotation.from_matrix(aim.T @ goal[:3, :3]).as_euler("zyx", degrees=True)[::-1]
+        return (wanted - self.state.turn_deg + 180.0) % 360.0 - 180.0
+
+    def turned_by(self, pose: np.ndarray, turn_deg: np.ndarray) -> np.ndarray:
+        """The poses (..., 4, 4) that ``turn`` leads to from a pose by tilt, rock and rotation (..., 3)
+        [degrees], about the centre of the array face.
+        """
+        aim = pose[:3, :3] @ _turn_matrix(self.state.turn_deg).T
+        rotation = aim @ _turn_matrix(np.add(self.state.turn_deg, turn_deg))
+        centre = _face_centre(pose, self.size_mm[2])
+        return rigid(rotation, centre + self.size_mm[2] / 2 * rotation[..., 2])
+
     def pose(self) -> np.ndarray:
         """The commanded pose: turned about the face's centre, moved to contact, then pressed in."""
         pose = self._turned(self.aim)
@@ -313,10 +331,14 @@ class ProbeManipulator:
 
     def _turned(self, aim: np.ndarray) -> np.ndarray:
         pose, length = aim.copy(), self.size_mm[2]
-        turn = Rotation.from_euler("zyx", self.state.turn_deg[::-1], degrees=True).as_matrix()
-        pose[:3, :3] = aim[:3, :3] @ turn
+        pose[:3, :3] = aim[:3, :3] @ _turn_matrix(self.state.turn_deg)
         pose[:3, 3] = _face_centre(aim, length) + length / 2 * pose[:3, 2]
         return pose
+
+
+def _turn_matrix(turn_deg: Sequence[float] | np.ndarray) -> np.ndarray:
+    """The rotations (..., 3, 3) by tilt, rock and rotation (..., 3) [degrees], about axes that turn along."""
+    return Rotation.from_euler("zyx", np.asarray(turn_deg)[..., ::-1], degrees=True).as_matrix()
 
 
 def _face_centre(pose: np.ndarray, length_mm: float) -> np.ndarray:

@@ -21,7 +21,7 @@ class Source(Protocol):
 
     @property
     def status(self) -> str:
-        """A line for the panel; empty if there is none."""
+        """What is wrong with the pose, for the line over the images; empty if nothing is."""
         ...
 
     def commands(self, frame: Frame, controls: Controls[LiveSettings], elapsed_s: float) -> Iterable[Command]:

@@ -212,7 +212,7 @@ class LiveMeasurements:
             findings=findings_of(judgement) if judgement is not None and is_judged else self._findings,
             alert=COMPRESSION if self.is_over_limit else "",
             seen=self._shown_coverage() if shown.show_seen else {},
-            guidance=self.guide.guidance() if self.guide is not None else None,
+            guidance=self.guide.guidance(shown.phase == "Scan") if self.guide is not None else None,
             status=status,
             notes={B_MODE: "NO CONTACT"} if self._touches.mean() < LEAST_CONTACT else {},
         )

@@ -28,6 +28,7 @@ from rehearsal.page.rest_model import (
 from rehearsal.page.session_images import SessionImages
 from rehearsal.result_files import counted
 from rehearsal.sessions.session_file import read_log
+from render.viewer import TextTable
 from scenes.anatomy import LoadedAnatomy
 from scenes.atomic_files import atomic_write
 from scenes.surfaces import save_surface, translated
@@ -50,16 +51,17 @@ def save_page_files(
     session: Path,
     summary: Mapping[str, Any],
     images: SessionImages,
-    attempts: Sequence[dict[str, Any]],
+    resection: dict[str, Any] | None,
+    attempts: TextTable,
     remarks: Sequence[str],
 ) -> list[Path]:
     """Write the page of a recorded session and its surfaces beside the session's file; return them.
 
-    ``summary`` is the session's, ``attempts`` are the figures of resections, ``remarks`` those of
-    ``import_remarks``. Raises OSError, UserError.
+    ``summary`` is the session's, ``resection`` has the figures of the present cut, if there is one,
+    ``remarks`` are those of ``import_remarks``. Raises OSError, UserError.
     """
     parts = model_parts(anatomy)
-    page = page_of(anatomy, loaded, parts, session, summary, images, attempts, remarks)
+    page = page_of(anatomy, loaded, parts, session, summary, images, resection, attempts, remarks)
     number = session.stem.rpartition("-")[2]
     written = [session.with_name(f"report-{number}.html")]
     with atomic_write(written[0]) as partial:
@@ -87,14 +89,15 @@ def page_of(
     session: Path,
     summary: Mapping[str, Any],
     images: SessionImages,
-    attempts: Sequence[dict[str, Any]],
+    resection: dict[str, Any] | None,
+    attempts: TextTable,
     remarks: Sequence[str],
 ) -> ReportPage:
     """The page, as ``save_page_files`` writes it. Raises UserError."""
     case, cut = anatomy.case, anatomy.cut
     towards, view = outward(anatomy), first_view(anatomy, parts)
     of_tumour = complexity(loaded, case.scene.attachment.at_mm)
-    resection = None if cut is None else translated(cut.resection_surface(), case.origin)
+    surface = None if cut is None else translated(cut.resection_surface(), case.origin)
     shown = images.captioned(has_cut=cut is not None)
     course = MeasurementCourse.of(read_log(session))
     return ReportPage(
@@ -102,8 +105,9 @@ def page_of(
         model=glb(parts),
         view=view,
         still=draw_model(parts, towards),
-        ct=draw_ct(loaded, resection),
+        ct=draw_ct(loaded, surface),
         images=[(caption, image_png(image)) for caption, image in shown],
+        resection=resection,
         attempts=attempts,
         tumour=[] if of_tumour is None else of_tumour.rows(),
         session=session_rows(anatomy, summary),

@@ -11,6 +11,7 @@ from typing import Any
 
 from rehearsal.resection.judgement import MARGIN_LIMITS_MM
 from rehearsal.resection.resection_page import COLOURS, rows_of
+from render.viewer import TextTable
 from version import VERSION
 
 FOLDER = Path(__file__).parent
@@ -25,6 +26,10 @@ NOT_MODELLED = (
     "The stiffness of this patient: it is a typical value, and the patient's own is not known.",
     "The picture is computed from the CT. What the CT does not show, the picture cannot show.",
 )
+# So many attempts fit on the page.
+MOST_ATTEMPTS = 6
+SHOWN = ' class="shown"'
+NOT_SHOWN = "None of them is shown on this page: the kidney is not cut at the end."
 MARGIN_NAMES = (
     "in the tumour",
     *(f"margin below {limit:g} mm" for limit in MARGIN_LIMITS_MM),
@@ -48,8 +53,9 @@ class ModelView:
 
 @dataclass(frozen=True)
 class ReportPage:
-    """What a page shows: pictures as PNG, the parts as a binary glTF, charts as SVG, figures of resections
-    as ``resection_page.report_of`` has them, and rows of a name and a value each.
+    """What a page shows: pictures as PNG, the parts as a binary glTF, charts as SVG, the figures of the
+    resection as ``resection_page.report_of`` has them, the attempts of the session, and rows of a name and a
+    value each.
     """
 
     title: str
@@ -58,7 +64,8 @@ class ReportPage:
     still: bytes
     ct: bytes | None = None
     images: Sequence[tuple[str, bytes]] = ()
-    attempts: Sequence[dict[str, Any]] = ()
+    resection: dict[str, Any] | None = None
+    attempts: TextTable | None = None
     tumour: Sequence[tuple[str, str]] = ()
     session: Sequence[tuple[str, str]] = ()
     charts: Sequence[str] = ()
@@ -72,7 +79,7 @@ class ReportPage:
             style=(FOLDER / "page.css").read_text("utf-8").strip(),
             remarks=self._remarks(),
             still=_base64(self.still),
-            legend=margin_legend() if self.attempts else "",
+            legend=margin_legend() if self.resection else "",
             first="\n".join(self._first()),
             second="\n".join(self._second()),
             model=_base64(self.model),
@@ -87,12 +94,17 @@ class ReportPage:
 
     def _first(self) -> Iterable[str]:
         """What is below the kidney on the first A4 page."""
-        if self.attempts:
-            yield _section("Resection", table(*attempt_table(self.attempts)))
+        if self.resection is not None:
+            # The warnings are at the top.
+            rows = [row for row in rows_of(self.resection) if row[0] != "import"]
+            yield _section("Resection", table(rows))
+        # The figures of a single attempt are those of the resection.
+        if self.attempts is not None and len(self.attempts.rows) > (self.attempts.marked is not None):
+            yield _section("Attempts", attempt_table(self.attempts))
         if self.tumour:
-            yield _section("Complexity of the tumour", table([], self.tumour))
+            yield _section("Complexity of the tumour", table(self.tumour))
         if self.session:
-            yield _section("Session", f'<div class="short">{table([], self.session)}</div>')
+            yield _section("Session", f'<div class="short">{table(self.session)}</div>')
 
     def _second(self) -> Iterable[str]:
         """The second A4 page."""
@@ -111,26 +123,30 @@ class ReportPage:
         yield _section("Not modelled", f"<ul>{sentences}</ul>")
 
 
-def attempt_table(
-    attempts: Sequence[dict[str, Any]],
-) -> tuple[list[str], list[tuple[str, ...]]]:
-    """The heads of the columns and the rows of a table of resections: a column for each, and of one no
-    heads.
-    """
-    columns = [dict(rows_of(figures)) for figures in attempts]
-    names = dict.fromkeys(name for column in columns for name in column if name != "import")
-    heads = [f"attempt {number}" for number in range(1, len(columns) + 1)] if len(columns) > 1 else []
-    return heads, [(name, *(column.get(name, "") for column in columns)) for name in names]
-
-
-def table(heads: Sequence[str], rows: Sequence[tuple[str, ...]]) -> str:
-    """A table of rows that begin with their name, with heads over the other columns."""
-    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
-    body = "".join(
-        f"<tr><th>{escape(name)}</th>{''.join(f'<td>{escape(value)}</td>' for value in values)}</tr>"
-        for name, *values in rows
+def attempt_table(attempts: TextTable) -> str:
+    """The attempts, of more than MOST_ATTEMPTS the last; the one that the page shows is marked."""
+    first = max(0, len(attempts.rows) - MOST_ATTEMPTS)
+    head = "".join(f"<th>{escape(text)}</th>" for text in attempts.headings)
+    rows = "".join(
+        f"<tr{SHOWN if number == attempts.marked else ''}>"
+        f"{''.join(f'<td>{escape(text)}</td>' for text in row)}</tr>"
+        for number, row in enumerate(attempts.rows)
+        if number >= first or number == attempts.marked
     )
-    return f"<table>{f'<thead><tr><th></th>{head}</tr></thead>' if head else ''}<tbody>{body}</tbody></table>"
+    marked = "Shown on this page: the attempt in bold." if attempts.marked is not None else NOT_SHOWN
+    earlier = (
+        f" Listed of {len(attempts.rows)}: the last {MOST_ATTEMPTS}, and the one shown." if first else ""
+    )
+    return (
+        f'<table class="attempts"><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>'
+        f'<p class="about">{marked}{earlier}</p>'
+    )
+
+
+def table(rows: Sequence[tuple[str, str]]) -> str:
+    """A table of names and values."""
+    body = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in rows)
+    return f"<table><tbody>{body}</tbody></table>"
 
 
 def margin_legend() -> str:

@@ -6,15 +6,22 @@ import numpy as np
 
 from rehearsal.case import Case
 from rehearsal.loop.frame import Frame
+from rehearsal.planning.guidance_words import NextPose, Side, completed_in_words, next_pose_in_words
 from rehearsal.planning.plan_file import Plan, PlannedSweep
+from rehearsal.planning.pose_distance import (
+    DEG_PER_MM_OFF,
+    DegreeOfFreedom,
+    arrows_between,
+    freedom_distances,
+)
 from rehearsal.planning.sweep_score import face_centres
 from render.viewer import Guidance
 from ultrasound.probe_manipulator import ProbeManipulator, advanced, indentation
 
 # A probe farther than NEAR_MM from the sweep does not follow it; within REACHED_MM a pose is reached.
 NEAR_MM, REACHED_MM = 6.0, 1.0
-# An angular deviation of this many degrees counts as one millimetre.
-DEG_PER_MM_OFF = 3.0
+# Another degree of freedom is named where it exceeds the one that was named by this factor.
+STEADY = 1.5
 # How many poses ahead of the next one are compared with the probe.
 AHEAD = 6
 # The path is drawn this far above the organ.
@@ -49,6 +56,8 @@ class PlanGuidance:
         self._poses = np.concatenate([np.zeros((0, 4, 4)), *passes])
         count = len(self._poses)
         self._progress = _Progress(0, np.zeros((count, 2)), np.full(count, np.inf))
+        self._pose: np.ndarray | None = None
+        self._named: DegreeOfFreedom | None = None
         self._progress_at: dict[int, _Progress] = {}
         drawn = np.array([self._above(pose) for pose in self._poses]).reshape(-1, 3)
         # Each segment ends at a pose that is not the first of its pass.
@@ -94,6 +103,7 @@ class PlanGuidance:
 
     def follow(self, pose: np.ndarray) -> None:
         """Take the transducer's pose (4, 4)."""
+        self._pose = pose
         at, deviation, combined = self._progress
         first = max(at - AHEAD, 0)
         now = self._deviation(pose, self._poses[first : at + AHEAD])
@@ -132,12 +142,36 @@ class PlanGuidance:
             off_mm, off_deg = map(float, self._progress.deviation[: self.next_pose].mean(axis=0))
         return dict(plan_followed=followed, plan_off_mm=off_mm, plan_off_deg=off_deg)
 
-    def guidance(self) -> Guidance | None:
+    def guidance(self, has_arrows: bool = True) -> Guidance | None:
         """For the 3D view; None where no sweep is shown."""
         if not self._is_shown:
             return None
-        goal = self._poses[self.next_pose] if self.next_pose < len(self._poses) else None
-        return Guidance(goal, self._segments, self._segment_ends < self.next_pose)
+        goal, arrows = self._goal, tuple[np.ndarray, ...]()
+        if has_arrows and goal is not None and self._pose is not None:
+            arrows = arrows_between(self.manipulator, self._pose, goal)
+        return Guidance(goal, self._segments, self._segment_ends < self.next_pose, arrows)
+
+    @property
+    def _goal(self) -> np.ndarray | None:
+        return self._poses[self.next_pose] if self.next_pose < len(self._poses) else None
+
+    def next_in_words(self, side: Side | None, has_keys: bool) -> str:
+        """What leads to the next pose, as ``next_pose_in_words``; empty where no sweep is shown."""
+        if not self._is_shown:
+            return ""
+        number, count, goal = self.next_pose, len(self._poses), self._goal
+        if goal is None:
+            return completed_in_words(count)
+        if self._pose is None:
+            return ""
+        distances = freedom_distances(self.manipulator, self._pose, goal)
+        largest = max(distances, key=lambda one: one.weight_mm)
+        # Words that change with each frame cannot be read.
+        before = [one for one in distances if one.freedom == self._named]
+        named = next((one for one in before if STEADY * one.weight_mm > largest.weight_mm), largest)
+        self._named = named.freedom
+        has_reached = number > 0 and bool(self._progress.combined_mm[number - 1] <= REACHED_MM)
+        return next_pose_in_words(NextPose(number + 1, count, has_reached, distances, named), side, has_keys)
 
     def in_words(self, coverage: float | None) -> str:
         """A line for the terminal, with the coverage of the target that was reached; empty where no sweep

@@ -45,11 +45,11 @@ class PlanJob:
     def status(self) -> str:
         """The completed share, and the remaining time at the pace so far, if there is one."""
         fraction = min(self._work_done / total_work(TRIALS, SPEED_MM_S), 1.0)
-        text = f"PLANNING   {100 * fraction:.0f} %"
+        text = f"Planning {100 * fraction:.0f} %"
         if self._work_done > 0:
             left_s = (perf_counter() - self._began_s) * (1.0 - fraction) / fraction
             text += f", {minutes_in_words(left_s)} left"
-        return f"{text}; {{next_plan}} stops"
+        return text
 
     def stop(self) -> None:
         """Cancel the search; its results are lost."""
@@ -93,7 +93,7 @@ class PlanControl:
 
     @property
     def status(self) -> str:
-        """A line for the panel while a plan is made."""
+        """For the window while a plan is made."""
         return "" if self._job is None else self._job.status
 
     def control(self, controls: Controls[LiveSettings]) -> None:

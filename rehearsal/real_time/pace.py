@@ -32,6 +32,8 @@ class Level:
 # steps get longer first.
 TIMES_LONGER = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 FEWER_ITERATIONS = (0.75, 0.5, 0.25)
+# Between the states of a text.
+SEPARATOR = "   "
 
 
 class Pace:
@@ -77,13 +79,13 @@ class Pace:
 
     def text(self, full: int) -> str:
         """What the user reads where steps are longer, or have fewer iterations than the ``full`` ones that
-        are set; else empty.
+        are set; else empty. Of both, with SEPARATOR between them.
         """
         length_s = self._length_s(len(self.levels) - 1) if self.waits_for_input else self.length_s
-        longer = f"LONGER STEPS   1/{1 / length_s:.0f} s" if self.levels[self.level].times_longer > 1 else ""
+        longer = f"Longer steps 1/{1 / length_s:.0f} s" if self.levels[self.level].times_longer > 1 else ""
         iterations = self.iterations(full)
-        fewer = f"REDUCED ITERATIONS   {iterations} of {full}" if iterations < full else ""
-        return "   ".join(filter(None, [longer, fewer]))
+        fewer = f"Reduced iterations {iterations} of {full}" if iterations < full else ""
+        return SEPARATOR.join(filter(None, [longer, fewer]))
 
     def note(self, took_ms: float, length_s: float) -> None:
         """Note the duration of a step of a length [s], and change the level if it is time to."""

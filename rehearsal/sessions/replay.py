@@ -54,8 +54,8 @@ class Replay:
 
     @property
     def status(self) -> str:
-        """As ``Source.status``."""
-        return f"REPLAY   {self.time_s:.1f} s   {{take_over}} takes control"
+        """For the window."""
+        return f"Replay {self.time_s:.0f} s: {{take_over}} takes control"
 
     def begin(self, positions: np.ndarray, seconds: float = 0.0) -> Iterator[Command]:
         """The commands that restore the last recorded state before a time [s] from which the rest can be

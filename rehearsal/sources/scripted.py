@@ -44,7 +44,12 @@ class ReplaySource:
     @property
     def status(self) -> str:
         """As ``Source.status``."""
-        return self.replay.status if self.user is None else self.user.status
+        return "" if self.user is None else self.user.status
+
+    @property
+    def replay_status(self) -> str:
+        """For the window while the recorded session is shown."""
+        return self.replay.status if self.user is None else ""
 
     def commands(self, frame: Frame, controls: Controls[LiveSettings], elapsed_s: float) -> Iterable[Command]:
         """As ``Source.commands``. Raises SessionError."""

@@ -77,12 +77,11 @@ class UserSource:
         # What restores a state, until it was applied: a pose that was asked for before would undo it.
         self._awaited: Command | None = None
         self._next_bookmark = 0
-        self._pace = ""
 
     @property
     def status(self) -> str:
-        """As ``Source.status``: the tracker has lost the probe, or the steps are not as they are set."""
-        return "TRACKING LOST" if self.tracker is not None and self.tracker.is_lost else self._pace
+        """As ``Source.status``: the tracker has lost the probe."""
+        return "TRACKING LOST" if self.tracker is not None and self.tracker.is_lost else ""
 
     @property
     def is_manual(self) -> bool:
@@ -123,7 +122,6 @@ class UserSource:
 
     def _see(self, frame: Frame, controls: Controls[LiveSettings]) -> None:
         """Take notice of what was done."""
-        self._pace = frame.pace
         done = [event.command for event in frame.events if isinstance(event, Applied | Refused)]
         if self._awaited in done:
             self._awaited = None

@@ -42,8 +42,8 @@ class SweepRecorder:
 
     @property
     def status(self) -> str:
-        """A line for the panel during a recording."""
-        return "" if self._sweep is None else f"RECORDING {self._due_s - self._began_s:.0f} s"
+        """For the window during a recording."""
+        return "" if self._sweep is None else f"Recording {self._due_s - self._began_s:.0f} s"
 
     def end(self, why: str = "") -> None:
         """End the current sweep, if there is one."""

@@ -113,9 +113,9 @@ class LiveLink(SimpleNamespace):
 # with.
 PACES = {
     "as set": (lambda: pace_at(0), "", {1}),
-    "longer steps": (lambda: pace_at(2), "LONGER STEPS", {2, 3, 4}),
+    "longer steps": (lambda: pace_at(2), "Longer steps", {2, 3, 4}),
     # With fewer iterations, too.
-    "slow motion": (lambda: pace_at(-1, SlowMachine), "REDUCED ITERATIONS", {2, 3, 4}),
+    "slow motion": (lambda: pace_at(-1, SlowMachine), "Reduced iterations", {2, 3, 4}),
 }
 
 

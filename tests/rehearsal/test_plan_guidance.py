@@ -269,7 +269,7 @@ EDGES = transducer_shape.edges(TransducerHousing(tuple(SIZE)))
 def drawn(lines: PlanLines, guidance: Guidance) -> tuple[np.ndarray, np.ndarray, list]:
     """Segments (n, 2, 3) that have a length, their colours (n, 3), and what else was drawn."""
     scene = Drawn()
-    lines.draw(scene, guidance)
+    lines.draw(scene, guidance, np.array([0.0, -1.0, 0.0]))
     (points, colours), *more = scene.given
     segments, each = points.reshape(-1, 2, 3), colours["per_vertex_color"].reshape(-1, 2, 3)
     long = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1) > 0
@@ -283,10 +283,12 @@ def test_the_completed_part_of_the_path_has_another_colour(one_device):
         if pose is not None:
             guide.follow(pose)
         guidance = guide.guidance()
-        segments, colours, (goal,) = drawn(lines, guidance)
+        segments, colours, (goal, *arrows) = drawn(lines, guidance)
         assert segments == pytest.approx(guidance.path_mm)
         assert np.array_equal(colours, np.where(guidance.done[:, None], DONE, TO_GO))
         assert goal[0] == pytest.approx(transducer_shape.placed(EDGES, guidance.goal), abs=1e-5)
+        # Before the first frame nobody knows where the probe is.
+        assert len(arrows) == len(guidance.arrows_mm) == (0 if pose is None else 1)
     for pose in [FIRST[3], *SECOND]:
         guide.follow(pose)
     _, colours, more = drawn(lines, guide.guidance())

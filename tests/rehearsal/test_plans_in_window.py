@@ -116,9 +116,9 @@ def ended(plans: PlanControl) -> str:
 def test_a_plan_is_made_during_the_rehearsal_and_then_followed(searching, plans, tmp_path):
     assert plans.status == ""
     assert message(plans, plan=True, settings=WIDER) == "Planning for the tumour and its margin"
-    assert message(plans) == "" and plans.status == "PLANNING   0 %; {next_plan} stops"
+    assert message(plans) == "" and plans.status == "Planning 0 %"
     searching.run_trials(3)
-    assert plans.status.startswith(f"PLANNING   {300 / total_work(TRIALS, SPEED_MM_S):.0f} %, ")
+    assert plans.status.startswith(f"Planning {300 / total_work(TRIALS, SPEED_MM_S):.0f} %, ")
     assert message(plans, plan=True) == "A plan is being made"
     searching.run_trials(1)
     assert ended(plans) == "Plan 1: two passes, covers 75 % (plan-001.json)"
@@ -145,12 +145,12 @@ def test_the_remaining_time_is_shown_once_there_is_a_pace(monkeypatch, searching
     message(plans, plan=True)
     assert searching.begun.wait(LONGEST_S)
     clock[0] += 30.0
-    assert plans.status == "PLANNING   0 %; {next_plan} stops"
+    assert plans.status == "Planning 0 %"
     searching.run_trials(2)
     # 30 s for two trials, then 30 s more without one.
     for clock[0] in (130.0, 160.0):
         left_s = (clock[0] - 100.0) * (total_work(TRIALS, SPEED_MM_S) - 2) / 2
-        assert plans.status.endswith(f" %, about {left_s / 60:.0f} min left; {{next_plan}} stops")
+        assert plans.status.endswith(f" %, about {left_s / 60:.0f} min left")
     searching.run_trials(2)
     ended(plans)
 

@@ -399,12 +399,12 @@ def test_slow_steps_get_longer_then_have_fewer_iterations_and_return():
     step_ms = 1000 / 60
     assert watched(pace, 0.9 * BUSY * step_ms, STEPS_UP) == (1 / 60, 8) and pace.text(8) == ""
     assert watched(pace, 1.1 * BUSY * step_ms, STEPS_DOWN) == (2 / 60, 8)
-    assert pace.waits_for_input and pace.text(8) == "LONGER STEPS   1/15 s"
+    assert pace.waits_for_input and pace.text(8) == "Longer steps 1/15 s"
     # Twice as long, they take half of the time that they simulate: more than is spare for short ones.
     assert watched(pace, 1.1 * BUSY * step_ms, 2 * STEPS_UP) == (2 / 60, 8)
     assert watched(pace, 100.0, 2 * STEPS_DOWN) == (4 / 60, 8)
     assert [watched(pace, 100.0, STEPS_DOWN)[1] for _ in range(4)] == [6, 4, 2, 2]
-    assert pace.text(8) == "LONGER STEPS   1/15 s   REDUCED ITERATIONS   2 of 8"
+    assert pace.text(8) == "Longer steps 1/15 s   Reduced iterations 2 of 8"
     assert watched(pace, 0.9 * SPARE * step_ms / 4, 6 * STEPS_UP) == (1 / 60, 8)
     assert Pace(1 / 60).iterations(1) == 1
     pace.level = len(pace.levels) - 1
@@ -460,10 +460,10 @@ def test_long_steps_wait_for_the_input_and_simulate_what_is_due_then():
     pace = Pace(1 / 30)
     assert not pace.waits_for_input and pace.lengths_s(0.1) == [1 / 30] and pace.text(8) == ""
     pace.level = 1
-    assert pace.waits_for_input and pace.text(8) == "LONGER STEPS   1/15 s"
+    assert pace.waits_for_input and pace.text(8) == "Longer steps 1/15 s"
     pace = Pace(1 / 10)
     pace.level = 1
-    assert pace.lengths_s(0.25) == [0.1, 0.1] and pace.text(8) == "REDUCED ITERATIONS   6 of 8"
+    assert pace.lengths_s(0.25) == [0.1, 0.1] and pace.text(8) == "Reduced iterations 6 of 8"
 
 
 def test_a_budget_limits_the_time_of_a_step():

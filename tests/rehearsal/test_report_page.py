@@ -39,10 +39,11 @@ from rehearsal.page.page_files import ASIDE_DEG, aside, save_page_files
 from rehearsal.page.page_pictures import image_png
 from rehearsal.page.report_page import (
     DEFAULT_TITLE,
+    MOST_ATTEMPTS,
     NOT_MODELLED,
+    NOT_SHOWN,
     ModelView,
     ReportPage,
-    attempt_table,
     margin_legend,
 )
 from rehearsal.page.rest_model import (
@@ -59,13 +60,14 @@ from rehearsal.page.rest_model import (
     tube,
 )
 from rehearsal.page.session_images import SessionImages, drawn
+from rehearsal.resection.attempts import HEADINGS, AttemptFigureList, AttemptFigures, table_of
 from rehearsal.resection.cut import CutSettings
 from rehearsal.resection.operation import cut_command
 from rehearsal.resection.proposal import line_around
 from rehearsal.resection.resection_page import COLOURS, report_of, rows_of
 from rehearsal.sessions.recorder import SessionRecorder, next_path
 from rehearsal.sessions.session_file import Header, Log
-from render.viewer import View
+from render.viewer import TextTable, View
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import EMBEDDED, Scene
 from ultrasound.probe import load_probe
@@ -97,7 +99,10 @@ def resected(one_device, tmp_path_factory):
     figures = report_of(anatomy)
     summary = LiveMeasurements(anatomy, rehearsal.manipulator).summary()
     remarks = ["the side is <not> certain"]
-    written = save_page_files(anatomy, loaded, session, summary, images, [figures], remarks)
+    attempts = AttemptFigureList(anatomy)
+    attempts.observe(anatomy.frame, case.probe)
+    about = summary, images, figures, attempts.table(), remarks
+    written = save_page_files(anatomy, loaded, session, *about)
     page = written[0].read_text("utf-8")
     return SimpleNamespace(anatomy=anatomy, figures=figures, written=written, page=page)
 
@@ -145,16 +150,49 @@ def test_the_page_has_the_figures_of_the_resection(resected):
     assert margin_legend() in resected.page
 
 
-def test_several_attempts_are_columns(resected):
-    less = resected.figures | dict(margin_min_mm=1.23, margin_asked_mm=4.0, score_to_tumour_mm=2.5)
-    heads, rows = attempt_table([resected.figures, less | dict(import_warnings=["one"])])
-    by_name = {name: values for name, *values in rows}
-    assert heads == ["attempt 1", "attempt 2"] and "import" not in by_name
-    assert by_name["margin"][1].startswith("1.2 mm least") and by_name["margin"][1].endswith("asked 4")
-    assert by_name["less than asked"] == ["", "the score is 2.5 mm from the tumour"]
-    page = page_of(attempts=[resected.figures, less]).html()
-    assert "<thead><tr><th></th><th>attempt 1</th><th>attempt 2</th></tr></thead>" in page
-    assert attempt_table([resected.figures])[0] == []
+def attempts_of(count: int, present: int | None, points: float | None = None) -> TextTable:
+    """Attempts whose figures follow from their number."""
+    technique = "enucleoresection"
+    figures = [
+        AttemptFigures(n, technique, 5.0, n + 0.1, n + 0.2, n + 0.3, 10.0 * n, n, points, points)
+        for n in range(1, count + 1)
+    ]
+    return table_of(figures, present)
+
+
+def rows_in(page: str) -> list[tuple[bool, list[str]]]:
+    """Of each row of the table of attempts whether it is marked, and its texts."""
+    rows = re.findall(
+        r"<tr( class=\"shown\")?>(.*?)</tr>", text_between(page, 'class="attempts">', "</table>")
+    )
+    return [(bool(mark), re.findall(r"<t[hd]>(.*?)</t[hd]>", row)) for mark, row in rows]
+
+
+def test_all_attempts_are_in_a_table_and_the_shown_one_is_marked(resected):
+    (_, heads), *rows = rows_in(page_of(resection=resected.figures, attempts=attempts_of(3, 2, 4.5)).html())
+    assert heads == [*HEADINGS, "points (plan 4.5)"]
+    assert [mark for mark, _ in rows] == [False, True, False]
+    figures = [
+        ["enucleoresection", "5", f"{n}.1", f"{n}.2", f"{n}.3", f"{10 * n}", f"{n}"] for n in (1, 2, 3)
+    ]
+    assert [texts for _, texts in rows] == [
+        [str(n), *row, "4.5"] for n, row in zip((1, 2, 3), figures, strict=True)
+    ]
+
+
+def test_an_attempt_is_in_the_table_where_the_page_does_not_show_it_alone(resected):
+    # The figures of the only cut are those of the resection.
+    assert rows_in(resected.page) == []
+    assert rows_in(page_of(attempts=attempts_of(0, None)).html()) == []
+    undone = page_of(attempts=attempts_of(1, None)).html()
+    assert [mark for mark, _ in rows_in(undone)] == [False, False] and NOT_SHOWN in undone
+
+
+def test_of_many_attempts_the_last_and_the_shown_one_are_there(resected):
+    page = page_of(resection=resected.figures, attempts=attempts_of(30, 4)).html()
+    numbers = [texts[0] for _, texts in rows_in(page)[1:]]
+    assert numbers == ["4", *map(str, range(31 - MOST_ATTEMPTS, 31))]
+    assert f"Listed of 30: the last {MOST_ATTEMPTS}, and the one shown." in page
 
 
 def test_a_title_is_text_and_nothing_else():
@@ -284,7 +322,7 @@ def test_an_organ_without_tumour_ct_or_a_step_has_a_page(tmp_path):
     loaded = LoadedAnatomy(organ=ball(R), tumour=None, ct=None, shapes=())
     SessionRecorder(session, header(), Notices()).close({})
     summary = SessionCourse(8.0).summary({}, [], 0)
-    written = save_page_files(anatomy, loaded, session, summary, SessionImages(), [], [])
+    written = save_page_files(anatomy, loaded, session, summary, SessionImages(), None, table_of([]), [])
     assert [path.name for path in written] == ["report-012.html", "kidney-012.glb", "kidney-012.stl"]
     page = written[0].read_text("utf-8")
     assert f"<h1>{DEFAULT_TITLE}</h1>" in page
@@ -475,7 +513,7 @@ def test_it_prints_on_two_pages_however_much_there_is(resected, tmp_path):
     assert printed_pages(resected.written[0], tmp_path) == 2
     vessels = [dict(tissue="artery", diameter_mm=3.0)] * 4
     less = dict(margin_min_mm=0.2, score_to_tumour_mm=2.5, tumour_seen_percent=53.0, vessels=vessels)
-    attempts = [resected.figures | less] * 3
+    less["import_warnings"] = ["one"]
     words = "text that is as long as a warning of an import that is not certain of a side and names a place, "
     rows = [("size", words), ("distance", words), ("R.E.N.A.L.", words), ("PADUA", 2 * words)]
     rows += [("estimated", words), ("not known", 2 * words)]
@@ -486,7 +524,8 @@ def test_it_prints_on_two_pages_however_much_there_is(resected, tmp_path):
         still=picture_of(990, 450),
         ct=picture_of(1210, 470),
         images=[(words, picture_of(480, 640))] * 4,
-        attempts=attempts,
+        resection=resected.figures | less,
+        attempts=attempts_of(30, 4, 4.5),
         tumour=rows,
         session=[("duration", "10 s"), ("probe", "one"), ("compression", "1 mm"), ("volume seen", "all")],
         charts=charts(MeasurementCourse(np.arange(9.0), values, [3.0]), 8.0),

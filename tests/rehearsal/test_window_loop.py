@@ -26,12 +26,14 @@ from rehearsal.input_files import InputFiles
 from rehearsal.live_settings import DEFAULT_KEYS
 from rehearsal.loop.command import BeginAction, Bookmark, Move, NewSession, SetValues, Undo
 from rehearsal.loop.frame import Frame, Step
+from rehearsal.machine_signs import machine_signs
 from rehearsal.notices import Notices
+from rehearsal.real_time.pace import SEPARATOR, Pace
 from rehearsal.window_loop import PREPARING, WindowLoop
 from rehearsal.window_panel import WindowPanel
 from render.viewer import Controls, View, ViewSettings
 from render.window import NoVulkan
-from scenes.scene import EMBEDDED, SceneError, load_scene
+from scenes.scene import EMBEDDED, AnatomyFiles, SceneError, load_scene
 from scenes.terminal import shell_command
 from settings import with_values
 from ultrasound.probe import load_probe
@@ -271,7 +273,7 @@ def test_images_have_the_pixels_of_their_boxes_unless_they_are_sent_or_recorded(
     assert looping.next().images["CT"].shape == (4, 4)
     looping.panel.link = None
     assert looping.next().images["CT"].shape == of_boxes
-    looping.panel.sweeping = SimpleNamespace(status="RECORDING 0 s", add=lambda *_: "")
+    looping.panel.sweeping = SimpleNamespace(status="Recording 0 s", add=lambda *_: "")
     assert looping.next().images["CT"].shape == (4, 4)
 
 
@@ -300,10 +302,10 @@ def test_a_pace_that_differs_is_said_once(tmp_path, capsys):
     announcements = Announcements(None, Notices())
     step = Step(0, np.eye(4), np.eye(4), STEP_S, 4, 1.0)
     frame = replace(fake_timeline().newest(), events=(step,))
-    for pace in ("", "LONGER STEPS   1/30 s", "LONGER STEPS   1/15 s", ""):
+    for pace in ("", "Longer steps 1/30 s", "Longer steps 1/15 s", ""):
         announcements.observe(replace(frame, pace=pace), None)
     assert announcements.notices.present() == []
-    assert capsys.readouterr().out == "LONGER STEPS   1/30 s\nSteps as they are set again.\n"
+    assert capsys.readouterr().out == "Longer steps 1/30 s\nSteps as they are set again.\n"
 
 
 def test_notices_name_the_users_keys_on_the_screen_and_in_the_terminal(looping, capsys):
@@ -316,17 +318,52 @@ def test_notices_name_the_users_keys_on_the_screen_and_in_the_terminal(looping, 
 # The panel
 
 
-def test_what_is_wrong_with_the_tissue_stands_before_all_that_is_technical(looping):
+def test_what_is_wrong_with_the_image_is_over_it_and_the_machine_has_signs(looping):
     looping.measurements.alert = {"status": "COMPRESSED"}
-    looping.panel.sweeping = SimpleNamespace(status="RECORDING 3 s", add=lambda *_: "")
-    looping.plans.status, looping.source.status = "PLANNING", "REDUCED ITERATIONS"
-    assert looping.next().status == "COMPRESSED   RECORDING 3 s   REDUCED ITERATIONS   PLANNING"
+    looping.panel.sweeping = SimpleNamespace(status="Recording 3 s", add=lambda *_: "")
+    looping.plans.status, looping.source.status = "Planning 12 %", "TRACKING LOST"
+    pace, newest = "Longer steps 1/15 s   Reduced iterations 2 of 8", looping.stepper.newest
+    looping.stepper.newest = lambda wait_s=0.0: replace(newest(wait_s), pace=pace)
+    view = looping.next()
+    assert view.status == "COMPRESSED   TRACKING LOST"
+    signs = ["Recording 3 s", "Longer steps 1/15 s", "Reduced iterations 2 of 8", "Planning 12 %"]
+    assert [sign.text for sign in view.signs] == signs
+    assert [sign.is_recording for sign in view.signs] == [True, False, False, False]
+    assert "L ends it" in view.signs[0].meaning and "Backspace stops it" in view.signs[3].meaning
     looping.notices.post("undo", in_terminal=False)
     # A message does not take the place of a state.
     view = looping.next()
-    assert view.messages == ("Undo",)
-    assert view.status == "COMPRESSED   RECORDING 3 s   REDUCED ITERATIONS   PLANNING"
-    assert looping.next(freeze=True).status == "COMPRESSED   RECORDING 3 s   FROZEN   PLANNING"
+    assert view.messages == ("Undo",) and [sign.text for sign in view.signs] == signs
+    # No step is made, of whatever length.
+    frozen = looping.next(freeze=True)
+    assert frozen.status == "COMPRESSED   FROZEN"
+    assert [sign.text for sign in frozen.signs] == ["Recording 3 s", "Planning 12 %"]
+
+
+def test_each_state_of_the_machine_has_a_sentence():
+    pace = Pace(1 / 60)
+    pace.level = len(pace.levels) - 1
+    states = [*pace.text(8).split(SEPARATOR), "Recording 3 s", "Replay 3 s: K takes control", "Planning 3 %"]
+    assert len(states) == 5 and len({sign.meaning for sign in machine_signs(states)}) == 5
+    assert machine_signs(["", ""]) == ()
+
+
+def test_guidance_along_a_plan_is_in_the_place_of_the_hint_while_scanning(looping):
+    asked = []
+    looping.measurements.guide = SimpleNamespace(
+        next_in_words=lambda side, has_keys: (
+            asked.append((side, has_keys)) or "tilt: {tilt_forward}\nTo go: 3"
+        )
+    )
+    looping.anatomy.case.scene.anatomy = AnatomyFiles(phantom=True)
+    assert looping.next().hint == "tilt: C\nTo go: 3"
+    # No mouse and keys move this probe.
+    assert asked[-1] == ("left", False)
+    settings = with_values(looping.viewer.settings, {"view.phase": "Score"})
+    assert looping.next(settings=settings).hint == "This patient has no tumour: there is nothing to cut out."
+    looping.measurements.guide.next_in_words = lambda side, has_keys: ""
+    settings = with_values(settings, {"view.phase": "Scan"})
+    assert looping.next(settings=settings).hint.startswith("The probe follows the mouse")
 
 
 def test_messages_that_were_read_are_in_the_log(looping):

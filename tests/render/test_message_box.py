@@ -5,7 +5,7 @@ import pytest
 
 from render.message_box import PAGE, STRIP, log_image, message_image, message_lines
 from render.text import font, wrapped
-from render.window_layout import FULL_SIZE, MESSAGE_LINES, WindowLayout
+from render.window_layout import FULL_SIZE, MESSAGE_LINES, MESSAGE_PITCH, WindowLayout
 
 SIZES = [(700, 420), (1024, 600), FULL_SIZE, (1920, 1080), (3840, 2160)]
 LONGEST = (
@@ -43,6 +43,15 @@ def test_what_is_longer_than_the_box_ends_in_dots():
 
 def test_without_messages_the_box_is_empty():
     assert (message_image(WindowLayout(*FULL_SIZE), ()) == STRIP).all()
+
+
+def test_each_line_of_a_hint_is_a_line():
+    layout = WindowLayout(*FULL_SIZE)
+    image = message_image(layout, (), "one\ntwo")
+    assert not np.array_equal(image, message_image(layout, (), "one two"))
+    above = message_image(layout, (), "one")
+    row = layout.figures_pad // 2 + layout.px(MESSAGE_PITCH)
+    assert np.array_equal(image[:row], above[:row]) and (image[row:] != above[row:]).any()
 
 
 @pytest.mark.parametrize("size", SIZES)

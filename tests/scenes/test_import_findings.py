@@ -16,6 +16,7 @@ from scenes.import_findings import (
     import_remarks,
     open_warnings,
     read_findings,
+    side_of,
     warning_lines,
 )
 from scenes.patients.patient_findings import _grid
@@ -100,6 +101,16 @@ def test_a_warning_that_was_not_shown_stays_open(folder):
     acknowledge(folder, ["another import's", TEXTS[0]])
     acknowledge(folder, [])
     assert open_warnings(files_scene(), folder) == TEXTS[1:]
+
+
+def test_the_side_is_that_of_the_import(folder, tmp_path):
+    assert side_of(files_scene(), folder) == "left"
+    path = folder / "import.json"
+    path.write_text(path.read_text().replace('"left"', '"right"'))
+    assert side_of(files_scene(), folder) == "right"
+    # Where no import has stated it.
+    assert side_of(files_scene(), tmp_path / "other") is None
+    assert side_of(Scene(anatomy=AnatomyFiles(phantom=True)), tmp_path) == "left"
 
 
 def test_a_folder_without_findings_has_no_warnings(tmp_path):

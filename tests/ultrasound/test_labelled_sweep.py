@@ -152,7 +152,7 @@ def test_the_length_of_a_sweep_is_shown_while_it_is_recorded(tmp_path):
             sweeping.add(time_s, view, anatomy.case.probe)
             said.append(sweeping.status)
         sweeping.toggle(tmp_path)
-    once = ["", *(f"RECORDING {seconds} s" for seconds in (0, 0, 1, 12))]
+    once = ["", *(f"Recording {seconds} s" for seconds in (0, 0, 1, 12))]
     assert [*said, sweeping.status] == [*once, *once, ""]
 
 
