@@ -130,21 +130,23 @@ def test_a_status_is_in_its_own_box_and_nothing_of_it_is_left():
     assert np.array_equal(shown[0], shown[2])
 
 
+COMPRESSED, PREPARING = "TISSUE COMPRESSED BY 12 mm   TRACKING LOST", "PREPARING THE IMAGE"
+
+
 @pytest.mark.parametrize("size", [(1280, 720), (1920, 1080)])
 @pytest.mark.parametrize(
-    "status",
-    ["FROZEN", "PREPARING THE IMAGE", "TISSUE COMPRESSED BY 12 mm   TRACKING LOST   PREPARING THE IMAGE"],
+    "status, shown",
+    [
+        ("FROZEN", "FROZEN"),
+        (PREPARING, PREPARING),
+        (f"{COMPRESSED}   {PREPARING}", COMPRESSED),
+    ],
 )
-def test_a_status_is_as_large_as_it_can_be_in_the_panel(size, status):
+def test_a_status_has_the_usual_font_and_leaves_out_the_last_parts_that_do_not_fit(size, status, shown):
     layout = WindowLayout(*size)
     plain, with_status = (ultrasound_panel.status_image(layout, text).astype(int) for text in ("", status))
     columns = np.flatnonzero(np.any(plain != with_status, axis=(0, 2)))
-    room = layout.panel.width - 2 * layout.px(16)
-    assert layout.status.width == room
-    # The usual font where that fits, but for the room beside its first and last letter; else one size more
-    # would not, which makes it wider by a ninth at most.
-    usual = font(layout.px(17)).getlength(status)
-    fits = usual <= room
-    assert (
-        np.ptp(columns) == pytest.approx(usual, abs=layout.px(5)) if fits else np.ptp(columns) > 0.88 * room
-    )
+    # But for the room beside its first and last letter.
+    assert np.ptp(columns) == pytest.approx(font(layout.px(17)).getlength(shown), abs=layout.px(5))
+    whole = font(layout.px(17)).getlength(status)
+    assert (whole <= layout.panel.width - 2 * layout.px(16)) == (shown == status)
