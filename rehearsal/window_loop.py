@@ -5,7 +5,7 @@
 2. while it makes the next step, the observers look at the last frame, and its 3D view is drawn;
 3. the newest frame is shown: surfaces and image plane move;
 4. its image is computed;
-5. it is drawn, with what was observed.
+5. it is drawn, with what was observed; while nothing moves, an image of another kind is prepared.
 """
 
 from dataclasses import dataclass, field, replace
@@ -13,6 +13,7 @@ from time import perf_counter
 
 from rehearsal.deformed_anatomy import DeformedAnatomy
 from rehearsal.drawn_geometry import drawn_geometry
+from rehearsal.image_preparation import ImagePreparation
 from rehearsal.imaging import image_view
 from rehearsal.live_settings import LiveSettings, with_recorded
 from rehearsal.loop.command import SetValues
@@ -54,7 +55,7 @@ class WindowLoop:
     _image_ms: list[float] = field(default_factory=list, init=False)
     _input_at_s: float | None = field(default=None, init=False)
     _version: int = field(default=0, init=False)
-    _kinds: set[tuple[str | bool, ...]] = field(default_factory=set, init=False)
+    _preparation: ImagePreparation = field(default_factory=ImagePreparation, init=False)
 
     def run(self) -> None:
         """Draw frames until the window is closed."""
@@ -79,6 +80,7 @@ class WindowLoop:
             with self.times.stage("drawing"):
                 self.window.draw(view)
             self._end(frame, view, controls)
+            self._prepare_image(frame, settings)
         self._observe(frame, probe)
 
     def _controls(self) -> Controls[LiveSettings]:
@@ -147,12 +149,16 @@ class WindowLoop:
         """Say over the last image that one of a new kind is prepared: compiling its kernels may take
         seconds.
         """
-        probe, image = settings.probe, settings.image
-        is_steered, is_compounded = probe.colour_steering_deg != 0, probe.compound_angles > 1
-        kind = image.mode, image.detail_level, is_compounded, settings.scanner.doppler, is_steered
-        if view is not None and kind not in self._kinds:
+        if view is not None and self._preparation.is_new(settings):
             self.window.draw(replace(view, status=PREPARING))
-        self._kinds.add(kind)
+        self._preparation.note(settings)
+
+    def _prepare_image(self, frame: Frame, settings: LiveSettings) -> None:
+        """While nothing moves, make an image of a kind that the next key may ask for."""
+        other = self._preparation.next(settings, frame.pose)
+        if other is not None and self.anatomy.scanner is not None:
+            image_view(self.anatomy, other)
+            self._preparation.note(other)
 
     def _end(self, frame: Frame, view: View, controls: Controls) -> None:
         input_s = frame.steps[-1].input_s if frame.steps and not self.frozen else None

@@ -221,8 +221,12 @@ def test_the_first_image_of_a_new_kind_is_announced_over_the_last_one(looping):
     drawn = []
     for change in (
         {},
+        # It is beside the B-mode image by now.
         {"image.mode": "ct"},
-        {},
+        # Nothing of it is seen over a CT.
+        {"scanner.doppler": "colour"},
+        {"image.mode": "both"},
+        {"scanner.doppler": "power"},
         {"scanner.doppler": "colour"},
         {"probe.compound_angles": 3},
     ):
@@ -230,7 +234,7 @@ def test_the_first_image_of_a_new_kind_is_announced_over_the_last_one(looping):
         looping.drawn.clear()
         looping.loop._announce_new_kind(View(np.eye(4), {}, 1.0, 1.0), settings)
         drawn.append([view.status for view in looping.drawn])
-    assert drawn == [[], [PREPARING], [], [PREPARING], [PREPARING]]
+    assert drawn == [[], [], [], [PREPARING], [PREPARING], [], [PREPARING]]
 
 
 def test_a_geometry_of_another_version_is_drawn_anew_and_earlier_images_are_forgotten(looping, monkeypatch):
