@@ -21,6 +21,15 @@ from rehearsal.input_files import InputFiles, check_anatomy, keys_of, read_files
 from rehearsal.real_time.pace import Pace
 from rehearsal.real_time.start_times import StartTimes
 from rehearsal.real_time.started_process import StartedProcess
+from rehearsal.start_progress import (
+    ANATOMY,
+    AT_REST,
+    FIRST_IMAGE,
+    FIRST_VIEW,
+    SURFACES,
+    TISSUE,
+    StartProgress,
+)
 from rehearsal.tracking.openigtlink_options import open_link
 from render.display import window_size, wrong_depth
 from render.gamepad import Gamepad, SdlPads
@@ -75,21 +84,15 @@ def opened(options: RehearseOptions, process: StartedProcess | None) -> Iterator
         if viewer is None and not (options.headless or has_trials):
             viewer = resources.enter_context(window(options, files.keys))
         with stages() as line:
-
-            def progress(stage: str) -> None:
-                start.begin(stage)
-                line(stage)
-                if viewer is not None:
-                    viewer.show_progress(stage)
-
-            progress("Anatomy")
+            progress = StartProgress(start, line, viewer)
+            progress(ANATOMY)
             anatomy = load_anatomy(files.scene, files.folder, progress)
             check_anatomy(files, options, anatomy)
             began, scene, chosen = perf_counter(), files.scene, ""
             if has_trials:
                 scene, chosen = scene_within_budget(files, anatomy, arch, progress, options)
                 if not options.headless:
-                    viewer = resources.enter_context(window(options, files.keys))
+                    progress.viewer = viewer = resources.enter_context(window(options, files.keys))
             # A session of this backend is replayed as it was recorded, on however many cores.
             serial = files.log.header.serial if files.log and files.log.header.arch == arch else None
             case = case_of(scene, anatomy, files.probe)
@@ -99,7 +102,7 @@ def opened(options: RehearseOptions, process: StartedProcess | None) -> Iterator
                 built = built_for_window(options, case, anatomy, serial, arch, solver, viewer, progress)
             build_s = perf_counter() - began
             if solver is None and not options.no_pictures:
-                progress("Building the model: the first picture")
+                progress(FIRST_IMAGE)
                 compile_picture(built.anatomy)
         # All this lives as long as the rehearsal: to look for garbage in it would delay single frames by a
         # tenth of a second.
@@ -184,7 +187,7 @@ def built_for_window(
     arch: str,
     solver: "SolverProcess",
     viewer: "Window[LiveSettings]",
-    progress: ReportProgress,
+    progress: StartProgress,
 ) -> "Built":
     """The rehearsal that a window shows.
 
@@ -202,16 +205,18 @@ def built_for_window(
     pace = Pace(time_step_s, options.budget_ms or np.inf)
     solver.build(SolverSetup(case, arch, pace, serial))
     scanned = scanned_ct(case, anatomy, case.scene.image.mode != "ct")
-    progress("Building the model: tissue and contacts")
-    model = solver.model()
-    progress("Building the model: surfaces")
+    progress(TISSUE)
+    model = solver.model(progress.wait)
+    progress(SURFACES)
     shown = DeformedAnatomy(case, anatomy, model.interpolation, scanned)
     shown.show(at_rest(case, model.interpolation))
-    progress("Building the model: the first picture")
+    progress(FIRST_IMAGE)
     viewer.show_scene(drawn_geometry(shown), initial_settings(case))
-    viewer.prepare(compile_picture(shown))
-    progress("Building the model: the tissue comes to rest")
-    solver.begin()
+    first = compile_picture(shown)
+    progress(FIRST_VIEW)
+    viewer.prepare(first)
+    progress(AT_REST)
+    solver.begin(progress.wait)
     manipulator = begin(case, shown, solver)
     return Built(shown, solver, manipulator, model.counts, model.serial)
 

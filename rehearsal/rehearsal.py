@@ -20,6 +20,7 @@ from rehearsal.loop.frame import Frame, Refused
 from rehearsal.loop.protocols import Stepper
 from rehearsal.loop.timeline import Timeline
 from rehearsal.pressed_organ import PressedOrgan
+from rehearsal.start_progress import AT_REST, SURFACES, TISSUE
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.scene import EMBEDDED, Scene, load_scene, scene_file, with_options
 from scenes.terminal import ReportProgress, no_progress
@@ -47,12 +48,12 @@ class Rehearsal:
         serial: bool | None = None,
     ) -> None:
         scanned = scanned_ct(case, loaded, needs_b_mode)
-        progress("Building the model: tissue and contacts")
+        progress(TISSUE)
         self.case = case
         self.organ = PressedOrgan(case, serial)
-        progress("Building the model: surfaces")
+        progress(SURFACES)
         self.anatomy = DeformedAnatomy(case, loaded, self.organ.model.carrier.interpolation, scanned)
-        progress("Building the model: the tissue comes to rest")
+        progress(AT_REST)
         self.organ.settle()
         self.timeline = Timeline(self.organ)
         self.manipulator = begin(case, self.anatomy, self.timeline)

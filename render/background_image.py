@@ -59,6 +59,7 @@ LETTER_PX, LINE_PX = 14, 2
 LEAST_LENGTH = 0.3
 HELP_HINT = "{}  keys"
 PROGRAM_PX = 40
+BAR_PX, BAR_HIGH_PX = 320, 4
 # In less room the title is left out.
 LEAST_TITLE = 60
 HELP_COLUMNS, HELP_PX, HELP_GAP_PX, FIGURES_GAP_PX = 2, 17, 12, 18
@@ -191,9 +192,9 @@ class BackgroundImage:
         box, height = self.layout.scene, self.layout.height
         return self.pixels[box.left : box.right, height - box.bottom : height - box.top]
 
-    def show_progress(self, text: str) -> None:
-        """Draw what is being prepared, until the first ``compose``."""
-        self.show_image(progress_image(self.layout, text))
+    def show_progress(self, text: str, share: float) -> None:
+        """Draw what is being prepared, and the share that is done, until the first ``compose``."""
+        self.show_image(progress_image(self.layout, text, share))
 
     def show_image(self, image: np.ndarray) -> None:
         """Draw an image over everything, uint8 (height, width, 3), until the first ``compose``."""
@@ -320,13 +321,18 @@ def clock_image(layout: WindowLayout, box: Rect, clock: str, pace: str) -> np.nd
     return np.asarray(image)
 
 
-def progress_image(layout: WindowLayout, text: str) -> np.ndarray:
-    """The program's name and what it prepares, uint8, shape (height, width, 3)."""
+def progress_image(layout: WindowLayout, text: str, share: float) -> np.ndarray:
+    """The program's name, what it prepares, and a bar of the share that is done, uint8, shape (height, width,
+    3).
+    """
     box, px = layout.whole, layout.px
     image = Image.new("RGB", (box.width, box.height), HELP)
     draw, middle = ImageDraw.Draw(image), (box.width // 2, box.height // 2)
     draw.text(middle, "Nephron", font=font(px(PROGRAM_PX)), fill=TEXT, anchor="ms")
     draw.text((middle[0], middle[1] + px(PROGRAM_PX)), text, font=font(px(HELP_PX)), fill=QUIET, anchor="mm")
+    left, top, width = middle[0] - px(BAR_PX) // 2, middle[1] + 2 * px(PROGRAM_PX), px(BAR_PX)
+    for part, colour in ((1.0, LINE), (share, MARK)):
+        draw.rectangle([left, top, left + part * width, top + px(BAR_HIGH_PX)], fill=colour)
     return np.asarray(image)
 
 

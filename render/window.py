@@ -150,10 +150,10 @@ class Window(Generic[UserSettings]):
         if self._software is not None:
             self._render(self._software, view, self._background.pixels.copy())
 
-    def show_progress(self, text: str) -> None:
-        """Show what is being prepared."""
+    def show_progress(self, text: str, share: float) -> None:
+        """Show what is being prepared, and the share that is done, 0 to 1."""
         if self._visible:
-            self._background.show_progress(text)
+            self._background.show_progress(text, share)
             self._put_image()
             self._window.show()
 

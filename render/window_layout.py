@@ -193,7 +193,11 @@ class WindowLayout:
         return Rect(gap, self.scene.top + gap, self.px(width), height)
 
     def sliders(self, widths: list[float]) -> list[Rect]:
-        """Boxes for groups of sliders, side by side in the strip, in proportion to `widths`."""
+        """Boxes for groups of sliders, side by side in the strip, in proportion to `widths`; none of no
+        group.
+        """
+        if not widths:
+            return []
         edges = np.concatenate([[0.0], np.cumsum(widths)]) / sum(widths) * self.slider_room(len(widths))
         gap = self.px(STRIP_GAP)
         return [

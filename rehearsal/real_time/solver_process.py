@@ -2,6 +2,7 @@
 ``Stepper``.
 """
 
+from collections.abc import Callable
 from time import perf_counter
 from typing import Any
 
@@ -14,13 +15,17 @@ from rehearsal.real_time.shared_tissue import SharedTissue
 from rehearsal.real_time.solver_loop import APART, BuiltModel, Sent, SolverSetup, arrays_of
 from rehearsal.real_time.started_process import END_S, StartedProcess
 
+# How often the window shows progress while it waits for the solver.
+WAIT_S = 0.1
+
 
 class SolverEnded(UserError):
     """The process has ended by itself."""
 
 
 class SolverProcess:
-    """A ``Stepper`` in another process: ``build`` gives it a case; ``model`` and then ``begin`` wait for it.
+    """A ``Stepper`` in another process: ``build`` gives it a case; ``model`` and then ``begin`` wait for it,
+    and meanwhile call what they are given, several times a second.
 
     Every method may raise SolverEnded.
     """
@@ -40,13 +45,13 @@ class SolverProcess:
         """Build the solver of a case."""
         self._send(setup)
 
-    def model(self) -> BuiltModel:
+    def model(self, wait: Callable[[], None] = lambda: None) -> BuiltModel:
         """What the window knows of the tissue model, as soon as it is built."""
-        return self._receive()
+        return self._awaited(wait)
 
-    def begin(self) -> None:
+    def begin(self, wait: Callable[[], None] = lambda: None) -> None:
         """Wait for the organ at rest."""
-        frame: Frame = self._receive()
+        frame: Frame = self._awaited(wait)
         self._memory = SharedTissue(arrays_of(frame))
         self._memory.write(arrays_of(frame), 0)
         self._send(self._memory.name)
@@ -116,6 +121,11 @@ class SolverProcess:
             self._connection.send(message)
         except OSError:
             raise self._ended() from None
+
+    def _awaited(self, wait: Callable[[], None]) -> Any:
+        while not self._connection.poll(WAIT_S):
+            wait()
+        return self._receive()
 
     def _receive(self) -> Any:
         try:
