@@ -1,6 +1,7 @@
 """Layout of the window. Pixels count from the top left; lengths below are those of a window of 1280 x 720."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -72,11 +73,11 @@ class WindowLayout:
     height: int
     has_engineer: bool = False
 
-    @property
+    @cached_property
     def scale(self) -> float:
         """Scale of texts and what depends on them, 1 in a window of FULL_SIZE."""
         share = min(self.width / FULL_SIZE[0], self.height / FULL_SIZE[1])
-        return float(np.clip(share, LEAST_SCALE, MOST_SCALE))
+        return min(max(share, LEAST_SCALE), MOST_SCALE)
 
     def px(self, pixels: float) -> int:
         """A length in this window of one in a window of FULL_SIZE [pixels]."""
