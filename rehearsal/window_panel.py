@@ -46,7 +46,7 @@ from ultrasound.probe import Probe
 REAL_TIME = 0.9
 # What the figures of speed on the screen are of.
 RECENT_S, RECENT_FRAMES = 1.0, 20
-HOW_TO_ACKNOWLEDGE = "{acknowledge}: I have checked this in check.png"
+HOW_TO_ACKNOWLEDGE = "{acknowledge} or a click here: I have checked this in check.png"
 HOW_TO_PRESS = "{press} or {push} presses"
 
 

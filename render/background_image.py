@@ -37,7 +37,7 @@ from render.ultrasound_panel import (
     to_plane,
 )
 from render.viewer import Phase, Sign, View
-from render.warning_box import warning_image, warning_rect
+from render.warning_box import acknowledge_rect, warning_image, warning_rect
 from render.window_layout import CLOCK_WIDTH, FIGURE_HEIGHT, Rect, WindowLayout
 
 READOUT_PERIOD_S = 0.4
@@ -175,6 +175,12 @@ class BackgroundImage:
         signs = sign_boxes(self.layout, view.signs, self._taken)
         boxes = self.layout.compass, findings, self._warning_rect(view), table, *signs, meaning
         return [box for box in boxes if box is not None]
+
+    def acknowledges_at(self, column: float, row: float) -> bool:
+        """Whether a click there acknowledges the warnings."""
+        warnings = () if self._view is None else self._view.warnings
+        box = acknowledge_rect(self.layout, warnings, self._taken)
+        return box is not None and box.contains(column, row)
 
     def _findings_of(self, view: View) -> dict[str, str]:
         """The findings that are shown: none where a table has their place."""

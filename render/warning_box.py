@@ -21,6 +21,14 @@ def warning_rect(layout: WindowLayout, warnings: tuple[str, ...], taken: int = 0
     return Rect(room.left, room.bottom - height, room.width, height)
 
 
+def acknowledge_rect(layout: WindowLayout, warnings: tuple[str, ...], taken: int = 0) -> Rect | None:
+    """The first line of the box, which says how to acknowledge the warnings, also by a click on it; None
+    without any.
+    """
+    box = warning_rect(layout, warnings, taken)
+    return None if box is None else box._replace(height=layout.px(FIGURE_HEIGHT) + layout.figures_pad)
+
+
 @lru_cache(maxsize=8)
 def warning_lines(layout: WindowLayout, warnings: tuple[str, ...], taken: int = 0) -> list[str]:
     """The lines of some warnings; of very long ones the last lines are left out."""

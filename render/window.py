@@ -284,6 +284,7 @@ class Window(Generic[UserSettings]):
             if self._cursor is not None and not self._page:
                 place = self._pixel(self._cursor)
                 controls.dismiss = self.layout.messages.contains(*place)
+                controls.acknowledge = self._background.acknowledges_at(*place)
                 self._click(place, controls)
                 controls.pointed_mm = self._background.plane_point_at(*place)
                 boxes = self._slider_boxes.items()

@@ -354,6 +354,22 @@ def test_warnings_stand_at_the_foot_of_the_3d_view(size):
 
 
 @each_size
+def test_a_click_on_the_first_line_of_the_warnings_acknowledges_them(size):
+    layout = WindowLayout(*size)
+    page, warnings = BackgroundImage(layout), ("how to acknowledge", LONG)
+    box = warning_rect(layout, warnings)
+    first_row, next_row = (box.top + layout.figures_pad + share * layout.px(21) for share in (0.5, 1.5))
+    middle = box.left + box.width / 2
+    composed(page)
+    assert not page.acknowledges_at(middle, first_row)
+    composed(page, warnings=warnings)
+    assert page.acknowledges_at(middle, first_row)
+    assert not page.acknowledges_at(middle, next_row)
+    assert not page.acknowledges_at(box.right + 1, first_row)
+    assert not page.acknowledges_at(middle, box.top - 1)
+
+
+@each_size
 def test_many_warnings_leave_most_of_the_3d_view_free(size):
     layout = WindowLayout(*size)
     box = warning_rect(layout, (LONG,) * 9)
