@@ -78,6 +78,25 @@ def fill_evenly(field: Field, value: float) -> None:
     fill((field, np.broadcast_to(value, (*field.shape, *field.element))))
 
 
+def part_of(field: Field, shape: tuple[int, ...], box: tuple[slice, ...]) -> np.ndarray:
+    """A copy of the values in a box of a field (n,) that is a grid of a shape, in C order."""
+    return _grid(field, shape)[box].copy()
+
+
+def fill_part(field: Field, shape: tuple[int, ...], box: tuple[slice, ...], values: np.ndarray) -> None:
+    """Write values into a box of a field (n,) that is a grid of a shape, in C order."""
+    grid = _grid(field, shape)
+    grid[box] = values
+    if not isinstance(field.memory, np.ndarray):
+        fill((field, grid.reshape(*field.shape, *field.element)))
+
+
+def _grid(field: Field, shape: tuple[int, ...]) -> np.ndarray:
+    """The values as a grid: on the CPU its own memory, elsewhere a copy."""
+    memory = field.memory if isinstance(field.memory, np.ndarray) else array_of(field)
+    return memory.reshape(*shape, *field.element)
+
+
 def array_of(field: Field) -> np.ndarray:
     """A copy of the values of a field, of shape (*field, *element)."""
     if isinstance(field.memory, np.ndarray):

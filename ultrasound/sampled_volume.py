@@ -5,7 +5,7 @@ import taichi as ti
 import taichi.math as tm
 import trimesh
 
-from sim.fields import array_of, field_of, fill
+from sim.fields import field_of, fill_part, part_of
 from sim.signed_distance import distance_grid
 
 AIR_HU = -1000.0
@@ -42,17 +42,11 @@ class SampledVolume:
 
     def values(self, box: tuple[slice, slice, slice]) -> np.ndarray:
         """A copy of the voxels in a box."""
-        return self._grid()[box]
+        return part_of(self.voxels, self.count, box)
 
     def set_values(self, box: tuple[slice, slice, slice], values: np.ndarray) -> None:
         """Replace the voxels in a box."""
-        grid = self._grid()
-        grid[box] = values
-        fill((self.voxels, grid.reshape(-1, *grid.shape[3:])))
-
-    def _grid(self) -> np.ndarray:
-        values = array_of(self.voxels)
-        return values.reshape(*self.count, *values.shape[1:])
+        fill_part(self.voxels, self.count, box, values)
 
     @ti.func
     def cell_at(self, p):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from sim.fields import array_of, field_of, fill, fill_evenly, zeros
+from sim.fields import array_of, field_of, fill, fill_evenly, fill_part, part_of, zeros
 
 
 @pytest.mark.parametrize("within", [0, 1, 2])
@@ -40,3 +40,17 @@ def test_an_array_read_is_a_copy(device):
 def test_an_array_of_another_shape_is_not_written(device):
     with pytest.raises(ValueError, match=r"shape \(3,\) for a field of shape \(4,\)"):
         fill((field_of(np.arange(4.0)), np.zeros(3)))
+
+
+@pytest.mark.parametrize("within", [0, 1])
+def test_a_box_of_a_grid_is_read_and_written_alone(device, within):
+    shape, element = (4, 3, 5), (2,) * within
+    values = np.random.default_rng(0).normal(size=(*shape, *element)).astype(np.float32)
+    field, box = field_of(values.reshape(-1, *element), within), (slice(1, 3), slice(0, 2), slice(2, 5))
+    part = part_of(field, shape, box)
+    assert np.array_equal(part, values[box])
+    fill_part(field, shape, box, 2 * part)
+    # What was read is a copy.
+    assert np.array_equal(part, values[box])
+    values[box] *= 2
+    assert np.array_equal(array_of(field).reshape(values.shape), values)
