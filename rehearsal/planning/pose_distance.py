@@ -73,8 +73,11 @@ def arrows_between(
     length, largest = float(np.linalg.norm(shift)), int(np.argmax(np.abs(turns)))
     arrows = []
     if length > NEGLIGIBLE_MM:
-        start = pose[:3, 3] + (manipulator.size_mm[2] / 2 + CLEAR_MM) * pose[:3, 2]
-        arrows.append(np.stack([start, start + max(length, LEAST_ARROW_MM) / length * shift]))
+        way = max(length, LEAST_ARROW_MM) / length * shift
+        # Also an arrow towards the housing ends outside it.
+        above = manipulator.size_mm[2] / 2 + CLEAR_MM + max(0.0, float(-way @ pose[:3, 2]))
+        start = pose[:3, 3] + above * pose[:3, 2]
+        arrows.append(np.stack([start, start + way]))
     if abs(turns[largest]) > NEGLIGIBLE_MM * DEG_PER_MM_OFF:
         angle = np.copysign(max(abs(turns[largest]), LEAST_ARROW_DEG), turns[largest])
         shares = np.linspace(0.0, 1.0, ARC_POINTS)[:, None]

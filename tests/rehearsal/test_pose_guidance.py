@@ -1,13 +1,25 @@
 """Guidance to the next pose: what the words and arrows say is what key and mouse then do."""
 
+import re
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
 import pytest
-from plan_ball import BALL, SIZE, guide_over_ball, manipulator_on, plan_of, straight_pass, sweep_of
+from plan_ball import (
+    BALL,
+    SIZE,
+    case_of_ball,
+    guide_over_ball,
+    manipulator_on,
+    plan_of,
+    straight_pass,
+    sweep_of,
+)
 
 from rehearsal.live_settings import DEFAULT_KEYS
 from rehearsal.planning.guidance_words import NextPose, next_pose_in_words, towards
+from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.pose_distance import (
     BEAM_MM,
     LEAST_ARROW_DEG,
@@ -17,7 +29,7 @@ from rehearsal.planning.pose_distance import (
     freedom_distances,
 )
 from rehearsal.sources.user import Hand
-from render.keys import hold
+from render.keys import HELD, hold
 from render.scene_view import TIP_MM, arrow_segments
 from render.viewer import Controls
 from ultrasound.probe_manipulator import ManipulatorState, ProbeManipulator
@@ -244,6 +256,56 @@ def test_the_named_degree_of_freedom_does_not_change_with_each_frame():
     assert named == [*["the patient's right"] * 3, *["the back"] * 2]
 
 
+# A user reads the line and does it: at most so often for a pose, each time so much of it.
+MOST_ACTS, SHARE = 150, 0.7
+
+
+def do_as_said(hand: Hand, line: str, side: str, pose: np.ndarray) -> np.ndarray:
+    """The pose after what the first line of the words says, by key or mouse alone."""
+    words, _, key = line.rpartition(": ")
+    amount = float(re.search(r"(\d+\.?\d*) (mm|degrees)", words)[1])
+    controls, seconds = Controls(None), 1.0
+    if key == "Mouse":
+        names = {name: place for place, name in (ENDS[side] | FIXED_ENDS).items()}
+        towards = words.partition(" towards ")[2].replace("the ", "").split(" and ")
+        way = sum(sign * np.eye(3)[axis] for axis, sign in map(names.__getitem__, towards))
+        face = (pose @ [0.0, 0.0, -SIZE[2] / 2, 1.0])[:3]
+        origin = face + 40.0 * pose[:3, 2] + SHARE * amount * way / np.linalg.norm(way)
+        controls.ray = origin, -pose[:3, 2]
+    else:
+        action = DEFAULT_KEYS.action_of(key.lower())
+        seconds = SHARE * amount / abs(HELD[action][1])
+        hold(action, controls, seconds)
+    return hand.pose(controls, pose, max(seconds, 1.0))
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("place", list(OUTWARD))
+def test_who_does_what_the_words_say_completes_the_sweep(place, side):
+    manipulator = manipulator_at(place, (10.0, -6.0, 25.0))
+    poses = []
+    for _ in range(6):
+        poses.append(manipulator.pose())
+        manipulator.slide(1.0, 2.0)
+        manipulator.turn(-2.0, 1.5, 3.0)
+    sweep, state = sweep_of(np.stack(poses)), manipulator.state
+    guide = PlanGuidance(case_of_ball(), manipulator, plan_of(sweep))
+    # From another place, and turned otherwise.
+    manipulator.state = replace(state, depth_mm=0.0, turn_deg=(-15.0, 20.0, -30.0))
+    manipulator.slide(-9.0, 6.0)
+    hand, pose, reached = Hand(manipulator), manipulator.pose(), list[str]()
+    for _ in range(MOST_ACTS):
+        guide.follow(pose)
+        line = DEFAULT_KEYS.worded(guide.next_in_words(side, True)).splitlines()[0]
+        if line.startswith("All 6 poses"):
+            break
+        reached += re.findall(r"Pose (\d) of 6 is reached", line)
+        pose = do_as_said(hand, line, side, pose)
+    assert line.startswith("All 6 poses") and guide.figures()["plan_followed"] == 1.0
+    # Those of a sweep may be passed by nearby; some are reached.
+    assert reached
+
+
 # Arrows
 
 
@@ -272,6 +334,9 @@ def test_arrows_point_to_the_goal_and_are_long_enough_to_be_seen():
     near[:3, 3] += [0.0, 1.0, 0.0]
     (move,) = arrows_between(manipulator, start, near)
     assert move[1] - move[0] == pytest.approx([0.0, LEAST_ARROW_MM, 0.0])
+    # Both ends are outside the housing, also where the probe goes in.
+    (pushed,) = arrows_between(manipulator, start, goal_of(manipulator, "depth", 6.0))
+    assert ((pushed - start[:3, 3]) @ start[:3, 2] >= SIZE[2] / 2 + 1.0).all()
     rocked = arrows_between(manipulator, start, manipulator.turned_by(start, np.array([0.0, 3.0, 0.0])))
     # At both sides of the image, which would hide one of them.
     sides = [arrow @ start[:3, 1] for arrow in rocked]
