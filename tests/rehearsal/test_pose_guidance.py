@@ -293,7 +293,7 @@ def test_who_does_what_the_words_say_completes_the_sweep(place, side):
     # From another place, and turned otherwise.
     manipulator.state = replace(state, depth_mm=0.0, turn_deg=(-15.0, 20.0, -30.0))
     manipulator.slide(-9.0, 6.0)
-    hand, pose, reached = Hand(manipulator), manipulator.pose(), []
+    hand, pose, reached = Hand(manipulator), manipulator.pose(), list[str]()
     for _ in range(MOST_ACTS):
         guide.follow(pose)
         line = DEFAULT_KEYS.worded(guide.next_in_words(side, True)).splitlines()[0]
@@ -302,7 +302,7 @@ def test_who_does_what_the_words_say_completes_the_sweep(place, side):
         reached += re.findall(r"Pose (\d) of 6 is reached", line)
         pose = do_as_said(hand, line, side, pose)
     assert line.startswith("All 6 poses") and guide.figures()["plan_followed"] == 1.0
-    # Poses may be passed by.
+    # Those of a sweep may be passed by nearby; some are reached.
     assert reached
 
 
