@@ -15,6 +15,7 @@ MEANINGS = {
         "The steps have fewer iterations than are set, to keep up with the clock: the tissue comes to rest "
         "more slowly."
     ),
+    "Cutting": "The cut along the score is computed: it takes one to three seconds.",
     "Planning": "A plan is searched while you continue: {next_plan} stops it.",
 }
 

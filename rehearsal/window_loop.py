@@ -16,8 +16,8 @@ from rehearsal.drawn_geometry import drawn_geometry
 from rehearsal.image_preparation import ImagePreparation
 from rehearsal.imaging import image_view
 from rehearsal.live_settings import LiveSettings, with_recorded
-from rehearsal.loop.command import SetValues
-from rehearsal.loop.frame import Frame
+from rehearsal.loop.command import CutOut, SetValues
+from rehearsal.loop.frame import Applied, Frame, Refused
 from rehearsal.loop.protocols import Observer, Source, Stepper
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.real_time.frame_times import FrameTimes
@@ -104,6 +104,8 @@ class WindowLoop:
             if isinstance(command, SetValues):
                 # Those of a replay are the window's too.
                 self.window.settings = with_recorded(self.window.settings, command.values)
+            if isinstance(command, CutOut):
+                self.panel.cutting = "Cutting"
             self.stepper.submit(command)
 
     def _use_waiting_time(self, frame: Frame, probe: Probe, view: View | None) -> None:
@@ -122,6 +124,8 @@ class WindowLoop:
     def _newest(self) -> Frame:
         """Show the newest frame."""
         frame = self.stepper.newest(MOST_WAIT_S)
+        if any(isinstance(e, Applied | Refused) and isinstance(e.command, CutOut) for e in frame.events):
+            self.panel.cutting = ""
         self.anatomy.show(frame)
         if frame.geometry.version != self._version:
             self._version = frame.geometry.version

@@ -82,6 +82,8 @@ class WindowPanel:
         self.warnings, self.folder = warnings, folder
         self.attempts = attempts or AttemptFigureList(anatomy)
         self.quit_check = quit_check or QuitCheck(notices)
+        # The sign of a cut that the solver computes.
+        self.cutting = ""
         self._shows_attempts = False
         self.sweeping = SweepRecorder(anatomy, notices)
         self.images = images or SessionImages()
@@ -245,7 +247,7 @@ class WindowPanel:
         """The states of the machine."""
         replay = self.source.replay_status if isinstance(self.source, ReplaySource) else ""
         pace = [] if self._frozen else self.anatomy.frame.pace.split(SEPARATOR)
-        signs = machine_signs([self.sweeping.status, replay, *pace, self.plans.status])
+        signs = machine_signs([self.sweeping.status, replay, self.cutting, *pace, self.plans.status])
         worded = self.keys.worded
         return tuple(replace(sign, text=worded(sign.text), meaning=worded(sign.meaning)) for sign in signs)
 

@@ -24,7 +24,7 @@ from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.imaging import captions, readouts, scale_texts
 from rehearsal.input_files import InputFiles
 from rehearsal.live_settings import DEFAULT_KEYS
-from rehearsal.loop.command import BeginAction, Bookmark, Move, NewSession, SetValues, Undo
+from rehearsal.loop.command import BeginAction, Bookmark, CutOut, Move, NewSession, SetValues, Undo
 from rehearsal.loop.frame import Frame, Step
 from rehearsal.machine_signs import machine_signs
 from rehearsal.notices import Notices
@@ -344,11 +344,26 @@ def test_what_is_wrong_with_the_image_is_over_it_and_the_machine_has_signs(loopi
     assert [sign.text for sign in frozen.signs] == ["Recording 3 s", "Planning 12 %"]
 
 
+def test_a_cut_has_a_sign_until_it_is_made_or_refused(looping):
+    submit, waiting = looping.stepper.submit, list[CutOut]()
+    looping.stepper.submit = lambda command: (
+        waiting.append(command) if isinstance(command, CutOut) else submit(command)
+    )
+    looping.source.also = [CutOut(technique="wedge", margin_mm=5.0, seen="")]
+    signs = [[sign.text for sign in looping.next().signs]]
+    looping.source.also = []
+    signs.append([sign.text for sign in looping.next().signs])
+    submit(waiting.pop())
+    signs.append([sign.text for sign in looping.next().signs])
+    assert signs == [["Cutting"], ["Cutting"], []]
+
+
 def test_each_state_of_the_machine_has_a_sentence():
     pace = Pace(1 / 60)
     pace.level = len(pace.levels) - 1
     states = [*pace.text(8).split(SEPARATOR), "Recording 3 s", "Replay 3 s: K takes control", "Planning 3 %"]
-    assert len(states) == 5 and len({sign.meaning for sign in machine_signs(states)}) == 5
+    states.append("Cutting")
+    assert len(states) == 6 and len({sign.meaning for sign in machine_signs(states)}) == 6
     assert machine_signs(["", ""]) == ()
 
 
