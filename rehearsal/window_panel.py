@@ -37,7 +37,7 @@ from rehearsal.sources.user import UserSource
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer, send_live
 from rehearsal.tracking.sweep_recording import SweepRecorder
 from render.keys import Keys
-from render.viewer import Controls, Sign, View
+from render.viewer import Controls, Sign, TextTable, View
 from scenes.import_findings import acknowledge, side_of
 from scenes.scene import SceneError
 from ultrasound.probe import Probe
@@ -46,7 +46,7 @@ from ultrasound.probe import Probe
 REAL_TIME = 0.9
 # What the figures of speed on the screen are of.
 RECENT_S, RECENT_FRAMES = 1.0, 20
-HOW_TO_ACKNOWLEDGE = "{acknowledge} or a click here: I have checked this in check.png"
+HOW_TO_ACKNOWLEDGE = "{acknowledge}, or a click on this line: I have checked this in check.png"
 HOW_TO_PRESS = "{press} or {push} presses"
 
 
@@ -149,7 +149,7 @@ class WindowPanel:
             caliper=self.caliper.figure(shown),
             readouts=figures | _speeds(times),
             warnings=self._warnings(),
-            table=self.attempts.table() if self._shows_attempts else None,
+            table=self._table() if self._shows_attempts else None,
             clock=f"{time_s:.1f} s",
             pace=self._pace(times),
             status=self._status(view),
@@ -212,6 +212,12 @@ class WindowPanel:
         """
         shown = tuple(f"Import: {text}" for text in self.warnings)
         return (self.keys.worded(HOW_TO_ACKNOWLEDGE), *shown) if shown else ()
+
+    def _table(self) -> TextTable:
+        """The attempts, with the key that returns to one."""
+        table = self.attempts.table()
+        how = self.keys.worded("{next_attempt} returns to the next attempt")
+        return replace(table, title=f"{table.title}   {how}") if table.rows else table
 
     def _pace(self, times: FrameTimes) -> str:
         """Simulated over real time, if the simulation is slower; empty while frozen."""

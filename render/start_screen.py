@@ -134,7 +134,7 @@ def list_screen(
     top += px(PITCH_PX + PAD_PX)
     listed = list(sessions)
     if not listed:
-        page.lines(left, top, page.right - left, "There are none in the folder of --out yet.", QUIET)
+        page.lines(left, top, page.right - left, "There are none yet.", QUIET)
     for session in listed:
         page.session(Rect(left, top, page.right - left, px(SESSION_PX - 6)), session)
         top += px(SESSION_PX)

@@ -300,6 +300,9 @@ class Window(Generic[UserSettings]):
         """Apply an action whose key went down, or whose tool was clicked on."""
         if action in PAGES:
             self._page = "" if self._page == action else action
+        elif action == "quit" and self._page:
+            # The question whether to quit would be under the page.
+            self._page = ""
         else:
             begin(action, controls)
 

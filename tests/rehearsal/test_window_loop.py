@@ -31,7 +31,7 @@ from rehearsal.notices import Notices
 from rehearsal.real_time.pace import SEPARATOR, Pace
 from rehearsal.window_loop import PREPARING, WindowLoop
 from rehearsal.window_panel import WindowPanel
-from render.viewer import Controls, View, ViewSettings
+from render.viewer import Controls, TextTable, View, ViewSettings
 from render.window import NoVulkan
 from scenes.scene import EMBEDDED, AnatomyFiles, SceneError, load_scene
 from scenes.terminal import shell_command
@@ -423,6 +423,10 @@ def test_the_table_of_attempts_is_shown_and_hidden_by_its_key(looping):
     shown = looping.next(show_attempts=True).table
     assert shown.rows == () and shown.title.startswith("No attempt yet")
     assert looping.next().table == shown and looping.next(show_attempts=True).table is None
+    kept = TextTable("1 attempt", ("attempt",), (("1",),), 0)
+    looping.panel.attempts = SimpleNamespace(table=lambda: kept)
+    table = looping.next(show_attempts=True).table
+    assert table.title == "1 attempt   Shift+N returns to the next attempt" and table.rows == kept.rows
 
 
 def test_a_frozen_image_keeps_its_caliper_and_a_live_one_until_the_probe_moves(looping):

@@ -476,6 +476,19 @@ def test_a_click_on_a_phase_or_a_tool_does_what_its_key_does(window, mouse):
     assert not opened.read_controls().dismiss
 
 
+def test_escape_closes_the_key_list_first(window, mouse):
+    opened, _, _ = window
+    for key, quits, is_open in (
+        ("h", False, True),
+        (ti.ui.ESCAPE, False, False),
+        (ti.ui.ESCAPE, True, False),
+    ):
+        mouse.presses(key)
+        assert opened.read_controls().quit == quits and bool(opened._page) == is_open
+        mouse.releases(key)
+        opened.read_controls()
+
+
 def test_the_mouse_over_the_scanners_sliders_does_not_move_the_probe(window, mouse):
     opened, _, _ = window
     change(opened, "view.show_scanner", True)
