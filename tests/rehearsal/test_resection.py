@@ -407,7 +407,7 @@ def test_the_view_warns_of_a_line_that_is_too_near_and_shows_the_coming_cut(rehe
     # Between marks a geodesic may be nearer than they are, by the sagitta of their arc.
     assert shown.tumour_mm.min() > MARGIN_MM - 0.5
     assert shown.score(MARGIN_MM + 2.0).is_near.all()
-    assert "is red where it is nearer to the tumour than the 7 mm asked" in hint_of("Score", margin_mm=7.0)
+    assert "mm from the tumour where it is red, 7 mm are asked" in hint_of("Score", margin_mm=7.0)
     assert float(shown.figures(CutSettings())["line to tumour"].split()[0]) == pytest.approx(
         shown.tumour_mm.min(), abs=0.06
     )

@@ -191,7 +191,7 @@ def test_figures_and_hint_of_a_score_say_how_near_it_is_and_how_much_was_seen():
         "depth": "as seen",
         "tumour surface seen": "63 %",
     }
-    assert "red where it is nearer to the tumour than the 5 mm asked, 3.3 mm" in hint_of("Score", wedge)
+    assert "3.3 mm from the tumour where it is red, 5 mm are asked" in hint_of("Score", wedge)
     assert "surface: 63 %" in hint_of("Excise", wedge)
     assert view.score(5.0).is_near.tolist() == [False, True, False]
     deep = CutSettings("enucleation", 3.5, 12.0)
