@@ -58,8 +58,8 @@ def _to_score(resection: ResectionView, settings: CutSettings) -> str:
     if nearest_mm < settings.margin_mm - TOLERANCE_MM:
         return (
             f"The line is {nearest_mm:.1f} mm from the tumour where it is red, {settings.margin_mm:.0f} mm "
-            "are asked: add a mark outside each red part ({score_under} on the kidney); {undo} takes the last "
-            "mark back; {show_resection} asks for less."
+            "are asked: add a mark outside each red part ({score_under} on the kidney); {undo} takes the "
+            "last mark back; {show_resection} asks for less."
         )
     return f"The line keeps {nearest_mm:.1f} mm from the tumour's outline. Next: Excise."
 
